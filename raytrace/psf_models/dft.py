@@ -94,7 +94,7 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
 
 
 def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
-    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
+    """The sum of `to_grid` over pairs of waves (L, M) and (-L, M) of equal field, given one of each: a real product."""
 
     def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
         cosine = 2 * torch.cos(2 * math.pi * _fraction(_columns(L, x, wavelength)))

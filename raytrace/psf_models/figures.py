@@ -239,11 +239,11 @@ def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, ro
     panel.set(xlim=(low, high), ylim=(bottom, top))
 
 
-def worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
-    """The title above and one caption below, both in lines that fit."""
+def worded(figure: Figure, title: str, notes: Sequence[str]) -> Figure:
+    """The figure with a title above and one caption below, both wrapped to its width."""
     width = figure.get_figwidth()
     figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)
-    figure.supxlabel(fill("; ".join(said), width, 7.5), fontsize=7.5, color=GREY)
+    figure.supxlabel(fill("; ".join(notes), width, 7.5), fontsize=7.5, color=GREY)
     return figure
 
 

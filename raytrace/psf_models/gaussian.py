@@ -105,7 +105,7 @@ def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
 
 
 def _interval(side: Side, sigma: Tensor) -> Tensor:
-    """Φ(upper/σ) - Φ(lower/σ) to a few roundings of its own size."""
+    """Φ(upper/σ) - Φ(lower/σ), with a relative error of a few roundings."""
     a, b, m, h = (_standard(distance, sigma) for distance in side)
     root = 2.0**-0.5
     left = m < 0

@@ -80,8 +80,8 @@ class Model:
     parameters: the class of its numbers, as `psf` takes them; those other than order and rays are keywords of
         `kernels`.
     lean: `kernels` without the residual, where that costs time.
-    plain: (scene, grid, rays=…) -> Kernels of independent rays, where the model has such.
-    of_points: (scene, grid, points) -> Kernels of the rays through pupil points (2, P), where the model has such.
+    plain: (scene, grid, rays=…) -> Kernels of independent rays; None for models without them.
+    of_points: (scene, grid, points) -> Kernels of the rays through pupil points (2, P); None for models without them.
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
         alone and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
@@ -163,7 +163,7 @@ def is_sampled_in_common(lens: Lens, model: str) -> bool:
 
 
 class NotConverged(RaytraceWarning):
-    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
+    """A PSF whose estimated error stays above the tolerance at the finest order."""
 
 
 def model_of(name: str, **numbers: Any) -> Parameters:

@@ -61,7 +61,7 @@ def blur_radius(scene: Scene) -> Tensor:
     """ε = R |1 - z_i (1/f - 1/z_o)|, (D, 1, W) mm; derivative 0 in focus.
 
     R: radius of the entrance pupil; z_i: from the rear principal plane to the sensor, z_o: from the object to the
-    front one, both along the light. In media 1/z_o is n/n′ of it.
+    front one, both along the light. In media other than air 1/z_o is multiplied by n/n′.
     """
     lens = scene.lens
     wavelengths = scene.wavelengths

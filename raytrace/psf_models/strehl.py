@@ -40,7 +40,7 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
 
 
 def _of_lens(scene: Scene, d: int, order: int) -> Tensor:
-    """The ratios (1, F, W) of one lens or object distance: the sampling of its light is its own."""
+    """The ratios (1, F, W) of one lens or object distance, whose light is sampled alone."""
     if scene.shape[0] > 1:
         scene = dataclasses.replace(scene, lens=one_lens(scene.lens, slice(d, d + 1)))
     return torch.cat([_of_field(one_field(scene, f), order) for f in range(scene.shape[1])], 1)

@@ -248,7 +248,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
         if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
     # Gaussian nodes between kinks are less dense in the middle than equal steps, by up to π/2; and an arm from a point
-    # beside the centre may be longer than 1, and the phase along it larger.
+    # off the centre may be longer than 1, and the phase along it larger.
     clear = arms_of(scene, math.ceil(1.25 * whole), fold)
     longest = scene.largest((clear.outer - clear.inner).detach().max().clamp_min(1.0))
     return clear.rule(math.ceil(rings * float(longest)))

@@ -53,7 +53,7 @@ class BaseRay:
     exit_pupil_position: from the image surface to that in image space; diameters > 0.
     paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
     magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
-    A quantity that does not exist (the focal length of an afocal lens, say) is infinite.
+    A quantity that does not exist, such as the focal length of an afocal lens, is infinite.
     """
 
     valid: Tensor
@@ -329,7 +329,7 @@ def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
 
 
 def _inverse(m: Tensor) -> Tensor:
-    """Inverse of matrices (..., 2, 2); infinite where there is none."""
+    """Inverse of matrices (..., 2, 2); infinite for singular ones."""
     a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
     adjugate = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
     return _over(adjugate, (a * d - b * c)[..., None, None])
@@ -366,7 +366,7 @@ def _sign(carried: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor, axis: int = -2) -> Tensor:
-    """Infinite where a vector is not a number, as one of an inverse that does not exist."""
+    """Lengths (...) of vectors; infinite for a vector of nan, as of an inverse that does not exist."""
     square = (vectors * vectors).sum(axis)
     return torch.where(square.isnan(), torch.inf, safe_sqrt(square))
 
@@ -378,6 +378,6 @@ def _over(numerator: Tensor | float, denominator: Tensor) -> Tensor:
 
 
 def _first(figures: Tensor) -> Tensor:
-    """(2, ...) of (..., 2); infinite what is not a number."""
+    """Figures (..., 2) as (2, ...); nan becomes infinite."""
     figures = torch.movedim(figures, -1, 0)
     return torch.where(torch.isnan(figures), torch.inf, figures)

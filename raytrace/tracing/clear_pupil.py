@@ -32,7 +32,7 @@ from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
 from raytrace.tracing.trace import without_apertures
 
-_SCAN, _COARSER = 32, 8  # steps along an arm in which edges are looked for, and where nothing stands inside the beam
+_SCAN, _COARSER = 32, 8  # steps along an arm in the search for edges, with and without an aperture inside the beam
 _NARROW, _NEAR, _ROUNDS = 2**-11, 1 / 32, 9  # an edge is enclosed in 2⁻¹¹ of its arm: slopes are good to 5e-4
 _NARROWER = 2**-20  # of an arm, where rays miss a surface: no slope leads on to the edge
 _MOST_PARTS = 3  # clear parts of one arm
@@ -53,7 +53,7 @@ class Edges:
 
     radius: (2, D, F, W, B) inner and outer; number: (2, D, F, W, B) of the clearance that is 0 there, as of
     `_clearances_at`: 0 for the edge of the pupil, -1 for the origin; slope: (2, D, F, W, B) of that clearance along the
-    arm, 0 where there is none; exists: (D, F, W, B), whether the arm has this part.
+    arm, 0 at the ends of the arm; exists: (D, F, W, B), whether the arm has this part.
     """
 
     radius: Tensor
@@ -81,7 +81,7 @@ class Arms:
 
     origin: (2, D, F, W) pupil point from which they start, unit: (2, D, F, W, B) their directions, share: (D, F, W, B)
     of the full angle that each represents, 1 in all. inner, outer: (D, F, W, B) radii between which light passes, with
-    derivatives. rays: how many were traced for each kernel. edges, kinks: what `rule_near` starts from.
+    derivatives. rays: how many were traced for each kernel. edges, kinks: the start of `rule_near`.
     """
 
     origin: Tensor
@@ -187,8 +187,8 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
 
     fold: the symmetry of the light, as of `scene.symmetry`: "mirror": arms in x > 0 alone; "round": a single one.
     They start inside the clear pupil. Where an aperture can stop light in the midst of the beam (an obscuration, a
-    polygon) they start at the centre of the pupil; if it stands beside the centre, the angles are of equal steps, and a
-    second or third clear part of all arms follows the first ones.
+    polygon) they start at the centre of the pupil; if it does not cover the centre, the angles are of equal steps, and
+    a second or third clear part of all arms follows the first ones.
     """
     like = scene.wavelengths
     around = 2 * math.pi if fold == "none" else math.pi
@@ -312,7 +312,7 @@ def _no_kinks(edges: Edges, count: int) -> Kinks:
 def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool) -> tuple[Kinks, int]:
     """Where another edge begins to bound the clear pupil, or blocked arms begin, for `count` arms.
 
-    There are none if an arm has several clear parts. And the number of rays traced for each kernel.
+    No kinks if an arm has several clear parts. Also returns the number of rays traced for each kernel.
     """
     is_whole = fold == "none"
     coarse = _COARSE if is_whole else _COARSE // 2
@@ -329,7 +329,7 @@ def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool)
     for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
         after = number.roll(-1, -1)
         changes.append((exists & exists_after & (number != after), 0.5 * (radius + radius.roll(-1, -1)), number, after))
-    # The last arm before blocked ones ends where its own two edges meet.
+    # The last arm before blocked ones ends where its two edges meet.
     ends = (0.5 * (inner + outer), number_in, number_out)
     radius, number, other = (torch.where(exists, t, t.roll(-1, -1)) for t in ends)
     changes.append(((exists != exists_after) & (number >= 0), radius, number, other))

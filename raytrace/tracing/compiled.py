@@ -48,9 +48,10 @@ def trace_engine(engine: str) -> Iterator[None]:
     """Within the block, trace by this engine: "eager", "compiled" or "auto".
 
     "auto", the default, takes the compiled trace for tensors on the CPU once it has been compiled, compiles it for a
-    batch that is worth it, and else falls back to eager. "compiled" raises NoCompiler where it cannot be compiled, but
-    leaves to torch what it does not support: other devices, forward derivatives, transforms of torch.func, height maps,
-    kinds of sag that are not compiled, and Fresnel lenses other than even aspheres. Raises ValueError for another name.
+    large batch, and else falls back to eager. "compiled" raises NoCompiler where it cannot be compiled, but falls back
+    to eager for all that the compiled trace does not support: other devices, forward derivatives, transforms of
+    torch.func, height maps, kinds of sag that are not compiled, and Fresnel lenses other than even aspheres. Raises
+    ValueError for another name.
     """
     token = _engine.set(_checked(engine, "trace_engine"))
     try:
@@ -80,7 +81,7 @@ def prepare() -> str:
 
 
 def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
-    """Whether the compiled trace carries these rays; numbers: any number of the lens, for its device and dtype."""
+    """Whether the compiled trace is used for these rays; numbers: a number of the lens, for its device."""
     requested = engine()
     dtypes = {part.dtype for part in (rays.direction, rays.position, rays.opl) if part is not None}
     if (
@@ -126,7 +127,7 @@ _POWERS = {name: kind.powers for name, kind in SAG_TERMS.items() if kind.powers 
 #: Codes of the shapes of apertures that the compiled trace supports.
 _SHAPES = {name: shape.code for name, shape in SHAPES.items() if shape.code is not None}
 
-#: What a phase becomes before it is traced, by `Form` of paths.h.
+#: Forms of phases in the compiled trace, by `Form` of paths.h.
 FORMS = (None, PolynomialPath, RadialPath, IdealLens, HologramPath, Facets)
 
 
@@ -229,7 +230,7 @@ def structure_of(
 ) -> tuple[Structure, list[Tensor]]:
     """The structure of a run of surfaces, and its numbers, tensors (...); arguments as for `steps`.
 
-    Axes that turn before a surface have a row of their own; a coordinate break is nothing else.
+    A pose before a surface is a row by itself; a coordinate break has this row alone.
     """
     table, rows = _Table(), []
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
@@ -291,7 +292,7 @@ def _row(
 
 
 def _turn(table: _Table, surface: Surface, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Row:
-    """The way over a gap into the axes of a surface; numbers as in `Turn` and turns.h."""
+    """The row of a passage over a gap into the axes of a surface; numbers as in `Turn` and turns.h."""
     thickness = gap.thickness if isinstance(gap, Gap) else gap
     rows = passage(gap, surface.before)
     lag = 0.0 if thickness is None else n1 * (thickness * side)
@@ -303,7 +304,7 @@ def _turn(table: _Table, surface: Surface, gap: Tensor | Gap | None, side: int, 
 
 
 def _form_of(surface: Surface, n1: Tensor, wavelength: Tensor | None) -> tuple[int, Sequence[Tensor]]:
-    """Which of the FORMS a phase takes, and its numbers there."""
+    """The number of the form of a phase in FORMS, and the numbers of that form."""
     phase = surface.phase
     if phase is None:
         return 0, ()

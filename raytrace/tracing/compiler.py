@@ -38,7 +38,7 @@ _FOLDER = getattr(os, "O_PATH", 0) | sum(getattr(os, name, 0) for name in ("O_DI
 
 
 class Untrusted(RaytraceError, OSError):
-    """Another user could write here; the message says where, and who."""
+    """Another user could write in a folder; the message has the folder and its owner."""
 
 
 def open_folder(path: Path, *, make: bool = False) -> int:

@@ -30,7 +30,7 @@ from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_
 from raytrace.tracing.trace import is_bent, side_behind
 from raytrace.words import RaytraceError
 
-_RINGS = 12  # of the pupil, where focus on the axis is found
+_RINGS = 12  # of the pupil, for the focus on the axis
 
 
 class Conjugates(TypedDict, total=False):
@@ -273,7 +273,7 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
 def focus_of_merit(
     merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10
 ) -> Tensor:
-    """Sensor distance (scalar, mm) that minimises a differentiable merit of it.
+    """Sensor distance (scalar, mm) that minimises a differentiable merit function of it.
 
     merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
     step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's

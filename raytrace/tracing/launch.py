@@ -195,7 +195,7 @@ def is_at_infinity(lens: Lens) -> bool:
 def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm.
 
-    And whether there are such (...): where no chief ray reaches a real image height, the field is on the axis.
+    And whether a chief ray reaches the real image height (...); where none does, the field is on the axis.
     """
     estimate = paraxial_field(lens, field, beam)
     if lens.fields.kind != "real_image_height":
@@ -210,7 +210,7 @@ def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]
 
 
 def paraxial_field(lens: Lens, field: Tensor, beam: Beam | FirstOrder) -> Tensor:
-    """As `object_field`, real image heights as if they were paraxial ones."""
+    """As `object_field`, with real image heights taken as paraxial ones."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind == "object_height":
         if at_infinity:
@@ -291,7 +291,7 @@ def stop_radius(lens: Lens) -> Tensor:
 
 
 def _stop_radius(lens: Lens, ray_aiming: str, beam: Beam, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
-    """And whether the real marginal ray reaches the stop; None if that is not traced."""
+    """The radius of the stop, and whether the real marginal ray reaches it; None if that ray is not traced."""
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value, None
     estimate = beam.stop_height.abs() if entrance is None else entrance.radius
@@ -311,7 +311,7 @@ def _signed(radius: Tensor, beam: Beam, entrance: Entrance | None) -> Tensor:
 
 
 def _aimed_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> Tensor:
-    """As `_signed`; warns MarginalRayLost."""
+    """The radius of the stop with the sign of `_signed`; warns MarginalRayLost."""
     radius, arrives = _stop_radius(lens, lens.ray_aiming, beam, entrance)
     if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
@@ -409,7 +409,7 @@ def _map_of(lens: Lens, field: Tensor) -> Tensor:
     same = (listed.reshape(2, -1, *(1,) * (field.dim() - 1)) == field[:, None]).all(0)
     at_listed = maps[:, same.to(torch.int64).argmax(0)]
     if not any(map(varies, (field, lens.fields.x, lens.fields.y))) and not is_any(~same.any(0)):
-        return at_listed  # what lies between fields serves derivatives by the field alone
+        return at_listed  # the interpolation is needed for derivatives by the field alone
     axes = (1,) * (field.dim() - 1)
     listed, is_first = listed.reshape(2, -1, *axes), (first.diff(prepend=first[:1] - 1) > 0).reshape(-1, *axes)
     between = _between(listed, maps.reshape(5, -1, *axes), is_first, field[:, None])
@@ -550,13 +550,13 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
-    """Warn UnfilledStop by the words of `unfilled`, if there are any."""
+    """Warn UnfilledStop with the text of `unfilled`, if it is not empty."""
     if words := unfilled(lens, fields, ray_aiming=ray_aiming):
         warnings.warn(words, UnfilledStop, stacklevel=calling_level())
 
 
 def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> str:
-    """Words for the field of (2, F) that misses the stop most, if it does by more than TOLERANCE; else empty.
+    """A text about the field of (2, F) whose rays miss the stop most, if by more than TOLERANCE; else empty.
 
     Of more than MOST_FIELDS fields so many are measured, and the largest one; of more than MOST_LENSES lenses so many,
     evenly spaced in the batch. Fields without rays at the stop are left to LostRays. Nothing is traced if rays are

@@ -69,7 +69,7 @@ def remarks(surface: Surface) -> list[str]:
 
 
 def entries(surface: Surface) -> dict:
-    """The same for a document: keys that only such surfaces have."""
+    """The kind of sag, the sag terms, the phase and the poses of a surface for a document; empty for a plain surface."""
     document: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
     for name, part in (("sag_terms", surface.sag_terms), ("phase", surface.phase)):
         if part is not None:
@@ -267,7 +267,7 @@ def _figures(lens: Lens) -> list[float]:
 
 
 def _telecentric(lens: Lens) -> list[str]:
-    """The spaces in which chief rays are parallel: where the pupil is a thousand lengths of the lens away, and more."""
+    """The spaces in which chief rays are parallel: the pupil is at least a thousand lengths of the lens away."""
     data = first_order(lens)
     far = 1e3 * max(sum(abs(float(surface.thickness)) for surface in lens.surfaces[1:-1]), 1.0)
     object_space = lens.fields.telecentric or abs(float(data.entrance_pupil_position)) > far

@@ -47,7 +47,7 @@ FURTHER_LINES = (
 
 @value
 class FirstOrder(Result):
-    """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
+    """First-order data of a lens at its primary wavelength or at other ones; every entry (...), mm.
 
     power: -ω′/y₁ in 1/mm.
     effective_focal_length: -y₁/u′ in image space, u′ taken along the light: positive for a concave mirror.
@@ -249,9 +249,9 @@ def system_matrix(
 ) -> Matrix:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω from the first vertex, before it, to behind the last surface.
 
-    The axis is straightened: tilts, decentres and the mean slope of a grating are left out, and what bends differently
-    along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
-    µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
+    The axis is straightened: tilts, decentres and the mean slope of a grating are ignored, and a surface of different
+    powers along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength:
+    (...) µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
     powers, gaps = _powers_and_gaps(surfaces, indices, wavelength)
     return _matrices(powers, gaps[:-1], indices[0], -1)[0]
@@ -337,7 +337,7 @@ def axial_beam(lens: Lens, wavelength: Tensor | None = None) -> Beam:
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     """First-order data; wavelength: (...) µm, the primary one by default. Source: Welford, Aberrations, ch. 3.
 
-    A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
+    A quantity that does not exist, such as the focal length of an afocal lens, is infinite.
     """
     wavelength = lens.primary if wavelength is None else wavelength
     beam = axial_beam(lens, wavelength)
@@ -387,15 +387,15 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
 
 
 def object_distance_of(lens: Lens) -> Tensor:
-    """The distance (...) mm of the object; of one at surface 1 so little that all is what it is in the limit."""
+    """The distance (...) mm of the object; for an object at surface 1 the smallest one that can be divided by."""
     distance = lens.surfaces[0].thickness
     return torch.where(distance == 0, torch.finfo(distance.dtype).tiny ** 0.5, distance)
 
 
 def largest_field(lens: Lens) -> Tensor:
-    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit.
+    """The field point (2, 1) along y at the distance of the lens's outermost field point from the axis, in its unit.
 
-    Where not every surface is round about one axis it is the outermost itself: directions are not alike.
+    In a lens without rotational symmetry it is the outermost field point itself.
     """
     if is_round_about_axis(lens):
         extent = lens.fields.extent
@@ -420,7 +420,7 @@ def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Ten
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
-    """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+    """Half angle of the cone at the object, radians, of an aperture given as object NA or cone angle."""
     kind, number = lens.aperture.kind, lens.aperture.value
     return torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
 

@@ -33,19 +33,19 @@ _RINGS = 8  # of the rays that try a field
 
 
 class LostRays(RaytraceWarning):
-    """Rays do not reach the sensor; the message says which, where they end and what helps."""
+    """Rays do not reach the sensor; the message has their field, the surfaces where they end and a remedy."""
 
 
 class OutOfReach(RaytraceError, ValueError):
-    """No ray of a field reaches the sensor; the message says where they end and what helps."""
+    """No ray of a field reaches the sensor; the message has the surfaces where they end and a remedy."""
 
 
 @value
 class Losses:
     """Number of rays that end at every surface, by their first failure.
 
-    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) not launched, for no
-    ray through their pupil point was found; launched: number of each field and wavelength.
+    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) not launched, because
+    ray aiming failed; launched: number of each field and wavelength.
     """
 
     lost: Tensor
@@ -112,7 +112,7 @@ def warn_of_failures(
     ray_aiming: str | None = None,
     prefix: str = "",
 ) -> None:
-    """Warn LostRays for every field that loses all its rays at a wavelength, where and why; and of too wide a beam.
+    """Warn LostRays, with causes, of every field whose rays all fail at a wavelength; and of too wide a beam.
 
     pupil: (2, P), through which rays are traced once more; dark: (F, W), which of the fields (2, F) and wavelengths
     (W,), the lens's by default; prefix: of the message, as the object distance.
@@ -172,7 +172,7 @@ def _help(lens: Lens, fields: Tensor | None) -> str:
         return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
     if fields is not None:
         largest = float(lens.fields.extent)
-        return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
+        return f"the fields of the lens reach {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
     return "give other fields by `fields`, a smaller beam by `f_number` or `entrance_pupil_diameter`"
 
 
@@ -181,10 +181,10 @@ def beam_hint(lens: Lens) -> str:
     if lens.aperture.kind not in ("object_na", "object_cone_angle"):
         return ""
     number = float(lens.aperture.value)
-    what = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
+    cone = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
     distance, diameter = float(lens.surfaces[0].thickness), float(axial_beam(lens).entrance_pupil_diameter)
     return (
-        f"the aperture is an {what}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
+        f"the aperture is an {cone}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
         "an F-number, an entrance pupil diameter or another aperture that the lens keeps would hold its beam"
     )
 

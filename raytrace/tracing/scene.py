@@ -37,8 +37,8 @@ Bundle = tuple[Lens, Tensor, Tensor, Tensor]
 class _Front:
     """Rays behind the first `count` surfaces after the object, in the frame of the last of them (of surface 1 if 0).
 
-    points: (2, ...) mm where they meet the surfaces that are asked for among these; indices: of all media, None if one
-    depends on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
+    points: (2, ...) mm where they meet the requested surfaces among these; indices: of all media, None if one depends
+    on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
     """
 
     count: int
@@ -100,7 +100,7 @@ class Memo:
     def front(self, bundle: Bundle, numbers: tuple[int, ...] | None = None) -> _Front:
         """The rays in front of the first surface that depends on a variable.
 
-        numbers: of surfaces at which their points are asked for; then they have no paths, and no aperture stops them.
+        numbers: of surfaces whose points are requested; then the rays have no paths, and no aperture stops them.
         """
         distance, pupil = bundle[0].surfaces[0].thickness, bundle[3]
         # Where rays fail, each object distance may have its own pupil points.
@@ -164,7 +164,7 @@ def _launched(bundle: Bundle) -> Rays:
 
 
 def _resumed(bundle: Bundle, front: _Front, memo: Memo) -> tuple[int, Rays, list[Tensor]]:
-    """Behind which surface the rays of a bundle go on, these rays, and the indices of all media."""
+    """The surface behind which the trace of a bundle resumes, its rays there, and the indices of all media."""
     lens, _, wavelength, _ = bundle
     memo.crossed += len(lens.surfaces) - 1 - front.count
     rays = _launched(bundle) if front.rays is None else front.rays

@@ -29,7 +29,7 @@ class Spot:
 
     centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about it, or about another point.
     mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
-    points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
+    points: (2, ..., P) and valid: (..., P) of the rays that were averaged; rays: number of valid ones.
 
     A spot that no weighted ray reaches is nan, with gradient 0: the sum with it is nan, the derivatives of the others
     are not. A merit that ignores it (`nansum`, a mask by `rays`) rewards the loss: constrain `rays`, add a penalty, or
@@ -64,8 +64,8 @@ def spot_of_points(
 ) -> Spot:
     """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot_of`.
 
-    One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
-    of one ray has radius 0 and gradient 0.
+    One point is subtracted before the mean is formed, so that a spot of 1 pm at 1 m from the axis loses no precision; a
+    spot of one ray has radius 0 and gradient 0.
     """
     shape = points.shape[1:]
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(shape)
@@ -109,10 +109,10 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
     """The numbers (..., *lit.shape) of spots where light arrives; elsewhere nan with gradient 0.
 
-    empty: "nan", or "error": then EmptySpot is raised if a spot is dark. Raises ValueError for another word.
+    empty: "nan", or "error", which raises EmptySpot if a spot is dark. Raises ValueError for another word.
     """
     if empty not in ("nan", "error"):
-        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', what a spot without rays is")
+        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', the value of a spot without rays")
     if empty == "error" and not bool(lit.all()):
         first = tuple(torch.nonzero(~lit)[0].tolist())
         raise EmptySpot(

@@ -278,7 +278,7 @@ def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]
 
 
 def lens_task(lens: Lens, rays: Rays, wavelength: Tensor) -> Task | None:
-    """The surfaces and rays of `trace_lens` as the compiled trace takes them; None where it does not carry them."""
+    """The input of the compiled trace for `trace_lens`; None where it does not support these surfaces or rays."""
     surfaces = sequence_of(lens)
     if not all(map(is_expressible, surfaces)):
         return None
@@ -288,7 +288,7 @@ def lens_task(lens: Lens, rays: Rays, wavelength: Tensor) -> Task | None:
 def points_on_surfaces(lens: Lens, rays: Rays, wavelength: Tensor) -> Tensor | None:
     """Points (3, K, ...) mm of rays before surface 1 on the K surfaces after the object, each in its own axes.
 
-    By the compiled trace, without gradients; None where it does not carry these rays, or where one is lost.
+    By the compiled trace, without gradients; None where it does not support these rays, or where a ray fails.
     """
     surfaces, task = sequence_of(lens), lens_task(lens, rays, wavelength)
     if task is None or not _is_compiled(surfaces, task):
@@ -329,7 +329,7 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
 
 
 def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
+    """The points (2, ...) mm where rays in front of surface 1 meet the stop, and whether they do, vignetted or not."""
     (stop,), arrives = points_at(lens, wavelength, (lens.stop,))(rays)
     return stop, arrives
 
@@ -361,7 +361,7 @@ def points_at(lens: Lens, wavelength: Tensor, numbers: Sequence[int]) -> Callabl
 def rays_at(
     lens: Lens, wavelength: Tensor, numbers: Sequence[int], *, first: int = 0, indices: Sequence[Tensor] | None = None
 ) -> Callable[[Rays], list[Rays]]:
-    """The map from rays to those behind each of the surfaces of these ascending numbers; apertures stop none.
+    """The map from rays to those behind each of the surfaces of these ascending numbers; no ray is vignetted.
 
     Surfaces and media are prepared once, for searches that trace many batches in turn. first: the surface that the rays
     are behind, 0 in front of surface 1; indices: of all media, computed by default.
@@ -412,7 +412,7 @@ def aiming_of(lens: Lens) -> str:
 
 
 def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
-    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    """Whether these first surfaces of a lens bend its axis."""
     if any(map(is_posed, surfaces[1:])):
         return True
     if all(map(is_round, surfaces)):
@@ -431,7 +431,7 @@ def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
 
 
 class Bent(RaytraceError, ValueError):
-    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
+    """A quantity that needs a straight axis is requested of a lens whose axis bends; the message has the surface."""
 
 
 def need_axis(lens: Lens, what: str, instead: str = "") -> None:
@@ -462,7 +462,7 @@ def pushed(surfaces: Sequence[Surface], task: Task, changes: Tensor, start: Chan
 def pushed_everywhere(
     surfaces: Sequence[Surface], task: Task, changes: Tensor, start: Changes | None = None
 ) -> Pushed | None:
-    """`compiled.push` behind every row where the compiled trace carries these rays; None where torch has to."""
+    """`compiled.push` behind every row; None where the compiled trace does not support these rays."""
     return push(task, changes, start, everywhere=True) if _is_compiled(surfaces, task) else None
 
 

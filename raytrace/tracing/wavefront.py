@@ -33,7 +33,7 @@ class Wavefront:
         diffraction integral.
     energy: (D, F, W, P) share of the entrance pupil's light that each ray carries to the sensor; 0 if lost.
     landing: (2, D, F, W, P) mm, where rays meet the sensor, from the centre.
-    valid: (D, F, W, P) bool; usable: also rays that were only vignetted, whose numbers mean something still.
+    valid: (D, F, W, P) bool; usable: also rays that were only vignetted.
     pupil: (2, P) or (2, D, F, W, P) fractions of the entrance pupil before vignetting factors, Zernike's coordinates.
     weights: of the pupil points, mean over the disc.
     centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, along the chief
@@ -140,7 +140,7 @@ def clear_wavefront(scene: Scene, rings: int, arms: int, *, reference: Tensor | 
 
 
 def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
-    """Rays of pupil points, the chief ray first, and which have numbers that mean something."""
+    """Rays of pupil points, the chief ray first, and which of them reach the sensor, vignetted or not."""
     rays = trace_scene(scene, with_chief)
     if is_bent(scene.lens):
         # Behind turned axes coordinates do not show which rays would arrive if nothing vignetted them.
@@ -150,7 +150,7 @@ def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
             unclipped = dataclasses.replace(scene, lens=without_apertures(scene.lens), memo=None)
             return rays, rays.valid | trace_scene(unclipped, with_chief).valid
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
-    # A chief ray along the axis has the numbers of a lost ray, and means them.
+    # A chief ray along the axis has the numbers of a failed ray, but is valid.
     on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
     return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
 
@@ -197,12 +197,12 @@ def _from_bent_pupil(scene: Scene, centre: Tensor, direction: Tensor) -> Tensor:
 
 
 def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """Mean OPD (D, F, W) in mm over the light that arrives; empty: what it is where none does, see `spot_of`."""
+    """Mean OPD (D, F, W) in mm over the light that arrives; empty: its value where none arrives, see `spot_of`."""
     return where_lit(_is_lit(wavefront), (_share(wavefront) * wavefront.opd).sum(-1), empty=empty)[0]
 
 
 def rms(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """RMS of the OPD about its mean (D, F, W), mm; empty: what it is where no light arrives, see `spot_of`."""
+    """RMS of the OPD about its mean (D, F, W), mm; empty: its value where no light arrives, see `spot_of`."""
     share = _share(wavefront)
     centred = torch.where(wavefront.valid, wavefront.opd - (share * wavefront.opd).sum(-1, keepdim=True), 0.0)
     return where_lit(_is_lit(wavefront), safe_sqrt((share * centred * centred).sum(-1)), empty=empty)[0]
@@ -222,7 +222,7 @@ def zernike_coefficients(
     """Coefficients 1 … count (D, F, W, count) in mm, fitted to the rays that arrive.
 
     numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
-    empty: what they are where the light fills too little of the entrance pupil to separate them (a fit would enlarge
+    empty: their value where the light fills too little of the entrance pupil to separate them (a fit would enlarge
     the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot_of`.
     Raises ValueError for another numbering.
     """
