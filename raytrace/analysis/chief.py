@@ -33,7 +33,7 @@ NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberra
 
 @value
 class Distortion(OverField):
-    """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
+    """Heights (F, W) in mm of chief rays on the sensor, and their relative error against the ideal image.
 
     height: from the vertex of the sensor, along the meridian of the field, positive towards +y (+x where it is the x
         axis), as the ray's own y; where the axis bends, along the image of the meridian. `image_height` of `hold` is
@@ -154,8 +154,8 @@ def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None
 
     Relative, in per cent in the table. Heights count from the vertex of the sensor; the ideal image, and with it the
     distortion, from the image of the axis, so that a shift of the whole image is none. The scale of the ideal image is
-    that of each wavelength's own chief ray close to the axis, on the sensor as it stands: an image out of focus is not
-    distorted for that. wavelengths: µm. Raises NothingToShow for the axis alone.
+    that of each wavelength's own chief ray close to the axis, on the sensor at its position: defocus is no
+    distortion. wavelengths: µm. Raises NothingToShow for the axis alone.
     """
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     refuse_axis(fields)
@@ -265,7 +265,7 @@ def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
 
 
 def _height(lens: Lens, fields: Tensor, along: Tensor, *, from_axis: bool = False) -> tuple[Tensor, Tensor]:
-    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted.
+    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are only vignetted.
 
     They count from the vertex of the sensor. Where the axis bends: along the image of the meridian close to it, turned
     to the side of the field; from_axis: from the image of the axis in each wavelength.

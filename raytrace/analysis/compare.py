@@ -45,14 +45,14 @@ _WHOLE = ("parameters", "rays")
 
 @value
 class Abilities(Result):
-    """What each model can represent: one number (M,) for each model and question, of the object in focus.
+    """The properties that each model can represent, of the object in focus: one number (M,) for each model.
 
     conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
     anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
         asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
         light (off axis).
-    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan where there is none (diffraction).
-    parameters: how many curvatures, conics and thicknesses move the kernel: have a derivative other than 0.
+    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan without a minimum (diffraction).
+    parameters: number of curvatures, conics and thicknesses by which the kernel has a derivative other than 0.
     rays: traced for one kernel on the axis.
     """
 
@@ -87,7 +87,7 @@ class Comparison(Result):
 
     psfs: of each model, kernels (D, 1, rows, columns); models: their names.
     object_distances: (D,) mm; sensor_distance: () mm from the last surface; wavelength: () µm.
-    abilities: what each model can represent, if that was asked.
+    abilities: the properties that each model can represent, or None.
     """
 
     psfs: tuple[Psf, ...]
@@ -302,7 +302,7 @@ def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid
 
 
 def _most_curved(lens: Lens) -> int:
-    """Number of the most curved surface that bends light: the image may be curved, and so may dummies."""
+    """Number of the most curved refracting or reflecting surface: the image and dummy surfaces may be curved, too."""
     indices = media(lens, lens.primary)
     strength = {
         k: abs(float(surface.curvature))
@@ -311,7 +311,7 @@ def _most_curved(lens: Lens) -> int:
     }
     if not strength:
         raise ValueError(
-            "the comparison of PSF models changes a conic, but no surface of this lens that bends light is curved; "
+            "the comparison of PSF models changes a conic, but no refracting or reflecting surface of this lens is curved; "
             "ask for kernels of one model by `psf`"
         )
     return max(strength, key=strength.__getitem__)
@@ -339,7 +339,7 @@ def _dark_ring(lens: Lens, model: Model, work: Mapping[str, Any]) -> float:
 
 
 def _parameters(lens: Lens, model: Model, work: Mapping[str, Any]) -> int:
-    """How many numbers of the lens move the kernel on a sensor 8 λN² behind its own, where no model has a point."""
+    """Number of variables of the lens that change the kernel on a sensor 8 λN² behind its own: in no model a point."""
     surfaces, numbers = list(lens.surfaces), list[Tensor]()
     for k, surface in enumerate(surfaces[:-1]):
         changes: dict[str, Any] = {"thickness": surface.thickness}

@@ -29,7 +29,7 @@ Outline = tuple[np.ndarray, np.ndarray]
 
 GLASSY = 1.01  # an index above which a medium is drawn as glass
 
-#: What goes upward in a view, by its number among x, y and z; z goes to the right.
+#: The coordinate that points upward in a view, by its number among x, y and z; z points to the right.
 UPWARD = {"yz": 1, "xz": 0}
 
 
@@ -112,8 +112,8 @@ def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] =
 
 
 def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
-    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone, where
-    it is smaller than the surface."""
+    """Centre (x, y) and radius in mm of the drawn part of a surface: a decentred aperture that is smaller than the
+    surface, else the whole."""
     for aperture in surface.apertures:
         rim = reach(aperture)[1]
         if not aperture.obscures and rim < radius and any(aperture.centre):
@@ -146,7 +146,7 @@ def heights(*radii: float) -> np.ndarray:
 def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor, stop: float | None = None) -> list[float]:
     """Radius in mm to which every surface is drawn.
 
-    The file's semi-diameter; where it has none, what the rays of all fields need and 4 % more; wavelength: () or (W,);
+    The semi-diameter of the file, else 4 % more than the rays of all fields reach; wavelength: () or (W,);
     stop: the radius of the stop, where it is known.
     """
     stored = [surface.semi_diameter or 0.0 for surface in lens.surfaces]
@@ -191,7 +191,7 @@ def glass(lens: Lens, number: int, places: list[Section], radii: list[float], in
 
 
 def _wedge(pair: tuple[Surface, Surface], places: tuple[Section, Section], radii: tuple[float, float]) -> Outline:
-    """The outline of glass between two surfaces that are tilted to each other: each to its own rim."""
+    """The outline of glass between two surfaces that are tilted to each other, each drawn to its rim."""
     profiles = []
     for surface, place, radius in zip(pair, places, radii, strict=True):
         height = heights(radius)
@@ -212,8 +212,8 @@ def element(
 ) -> Outline:
     """Outline (z, y) of the glass between two surfaces, each drawn to its own radius.
 
-    The smaller surface is carried on to the rim of the larger: flat, as it is ground, or along its own sag where it is
-    cemented or where a flat would cut the other surface; where nothing fits, the rim is where the two surfaces meet.
+    The smaller surface continues to the rim of the larger: flat, as it is ground, or along its sag where it is cemented
+    or where a flat would cut the other surface; otherwise the rim is where the two surfaces meet.
     """
     rim = max(radii)
     y = heights(*radii)
@@ -240,8 +240,8 @@ def ray_paths(
 ) -> list[list[RayPath]]:
     """The paths of every field's rays, from the plane z_start (mm) or the object, whichever is nearer.
 
-    A path ends at the image or at the surface where the ray is lost: a vignetted or totally reflected one at its hit,
-    one that misses in the surface's vertex plane. Surfaces that do not bend light are no corners of a path.
+    A path ends at the image or at the surface where the ray fails or is vignetted: a ray that misses a surface in the
+    plane of its vertex, another ray at its hit. Surfaces that do not deflect light are no corners of a path.
     """
     corners, endings, ends = _corners(lens, pupil, fields, wavelength, z_start)
     bends, seen = _bends(lens, wavelength), [2, UPWARD[view]]

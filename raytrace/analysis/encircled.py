@@ -34,7 +34,7 @@ _RINGS_PER_STEP = 16
 class EncircledEnergy(Analysis):
     """Share (F, K) of the light that reaches the sensor within radii (K,) mm of the centroid (2, F) mm of the rays.
 
-    fields: (2, F); geometric: of rays, without diffraction; marked: whether the radii were asked for, and are marked on
+    fields: (2, F); geometric: of rays, without diffraction; marked: whether the radii were specified, and are marked on
     the curves.
     """
 
@@ -57,7 +57,7 @@ class EncircledEnergy(Analysis):
 
     @styled
     def draw(self) -> Figure:
-        """Share of the light over the radius about the centroid. Radii that were asked for are marked."""
+        """Share of the light over the radius about the centroid. Specified radii are marked."""
         curves = self.drawn()
         panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
         radii = 1e3 * array(curves.radii)
@@ -126,7 +126,7 @@ def _rays_of(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _of_rays(distance: Tensor, energy: Tensor, radii: Tensor) -> Tensor:
-    """Half of a ray's light counts at its own distance; the curve is linear in between, and starts at 0."""
+    """Half of the light of a ray counts at its distance; the curve is linear in between, and starts at 0."""
     distance, order = torch.where(energy > 0, distance, distance.max()).sort(-1)
     energy = torch.gather(energy, -1, order)
     half = energy.cumsum(-1) - 0.5 * energy

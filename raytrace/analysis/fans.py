@@ -17,7 +17,7 @@ from raytrace.system.lens import Lens
 from raytrace.tracing.spot import chief_arrives, image_rays
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
-#: Whose sphere an OPD is measured on.
+#: Wavelengths whose chief ray centres the reference sphere of an OPD.
 REFERENCES = ("primary", "own")
 _UNIT = {"ray": "mm", "opd": "waves"}
 

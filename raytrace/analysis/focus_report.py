@@ -62,7 +62,7 @@ _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial fo
 
 
 class NoFocus(RaytraceError, ValueError):
-    """The light of an object has no focus; the message says why and what helps."""
+    """The light of an object has no focus; the message has the cause and a remedy."""
 
 
 class VirtualImage(RaytraceWarning):

@@ -106,7 +106,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     """Distortion over `points` × `points` objects, at whose corners the largest field lies, square in tan θ or in mm.
 
     With the points (0, 0), (δ, 0) and (0, δ) close to the axis the ideal image of a field f is J f, J their differences
-    over δ, counted from the image of the axis: on the sensor as it stands, whatever its focus. wavelengths: µm, the
+    over δ, counted from the image of the axis: on the sensor at its position, in focus or not. wavelengths: µm, the
     lens's primary one by default. points: across the grid. Vignetting factors are left out: chief rays go through the
     middle of the pupil. Raises NothingToShow for the axis alone.
     """

@@ -25,9 +25,10 @@ _TERMS = 45  # Zernike terms (to degree 8) of the map from the pupil to directio
 
 @value
 class RelativeIllumination(OverField):
-    """illumination: (F,), 1 on the axis; projected_solid_angle: (F,) sr; fields: (2, F).
+    """Relative illumination over the field.
 
-    marked: whether the fields were asked for, and are marked on the curve.
+    illumination: (F,), 1 on the axis; projected_solid_angle: (F,) sr; fields: (2, F).
+    marked: whether the fields were specified, and are marked on the curve.
     """
 
     lens: Lens

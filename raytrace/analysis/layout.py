@@ -37,7 +37,7 @@ from raytrace.tracing.trace import trace_lens
 if TYPE_CHECKING:  # slow to load
     from matplotlib.patches import Polygon
 
-_LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
+_LEAD = 0.14  # of the length of the lens: rays of a far object start at this distance in front of it
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
 
 
@@ -58,8 +58,8 @@ ALL = "all"
 class Layout(Result):
     """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
 
-    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
-    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
+    view: a key of VIEWS. configuration: ALL where the configurations of the lens are superimposed, else None.
+    has_fields: whether the fields were specified; otherwise each configuration is drawn with its nominal fields.
     """
 
     lens: Lens
@@ -124,7 +124,7 @@ def layout(
     that is shown; view: "yz" (from the side), "xz" (from above) or "3d" (in space); wavelengths: µm, by default the
     primary one; rays of several are coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all":
     superimposed, rays coloured by configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made.
-    Raises ValueError for a view or a configuration that there is not.
+    Raises ValueError for an unknown view or configuration.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
@@ -284,7 +284,7 @@ def _drawn(
 
 
 def _framed(axes: style.Axes, drawn: Sequence[_Drawn]) -> None:
-    """The frame of one cross section, or of several in each other's place."""
+    """The frame of one cross section, or of several superimposed ones."""
     if any(section.is_bent for section in drawn):
         _frame_bent(axes, [section.places for section in drawn])
         return
@@ -294,7 +294,7 @@ def _framed(axes: style.Axes, drawn: Sequence[_Drawn]) -> None:
 
 
 def _extent(lens: Lens, places: Places, radii: list[float]) -> tuple[tuple, tuple]:
-    """How far surfaces reach, ((left, right), (low, high)) mm; the image by its vertex."""
+    """The extent of the surfaces, ((left, right), (low, high)) mm; the image by its vertex."""
     right, up = [places[-1].origin[0]], [places[-1].origin[1]]
     for k in range(1, len(places) - 1):
         height = np.array([-radii[k], 0.0, radii[k]])
@@ -412,7 +412,7 @@ def _draw_rays(axes: style.Axes, paths: Paths, colours: Sequence) -> None:
 
 
 def _draw_sensor(axes: style.Axes, lens: Lens, place: cross_section.Section, radii: list[float], paths: Paths) -> float:
-    """The image surface, as far as the rays need it; returns its half height in mm."""
+    """Draw the image surface, as large as the rays need it; returns its half height in mm."""
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
     low, high = min(hits, default=0.0), max(hits, default=0.0)
@@ -435,7 +435,7 @@ def _draw_object(axes: style.Axes, lens: Lens, place: cross_section.Section, pat
 
 
 def _ray_heights(paths: Paths) -> tuple[float, float]:
-    """Lowest and highest y in mm of rays that do not run astray."""
+    """Lowest and highest y in mm of rays that arrive or are vignetted."""
     y = [path.y for field in paths for path in field if path.status in ("ok", "vignetted")]
     return (float(np.concatenate(y).min()), float(np.concatenate(y).max())) if y else (0.0, 0.0)
 

@@ -17,7 +17,7 @@ from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, frames
 
 _RINGS, _ARMS, _TILES = 6, 48, 80  # of the mesh of a surface; of obscurations across it
-_LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start
+_LEAD = 0.14  # of the size of the system: rays of a far object start at this distance in front of it
 Colour = str | tuple[float, ...]
 
 _MIRROR = "#b9c2ca"

@@ -68,7 +68,7 @@ class Mtf(Analysis):
         modulation exceeds; None for rays alone.
     frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: all fields by rays, without diffraction.
     by_rays: (F,) bool, fields by rays, without diffraction.
-    marked: whether the frequencies were asked for, and are marked on the curves.
+    marked: whether the frequencies were specified, and are marked on the curves.
     """
 
     lens: Lens
@@ -228,7 +228,7 @@ def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bo
 def _of_field(
     lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor, memo: Memo | None = None
 ) -> tuple[Tensor, Tensor, bool, Callable[[], tuple[Tensor, Tensor]]]:
-    """Tangential and sagittal MTF (1, K) of a field (2, 1), whether of rays, and what makes both of its pupil alone.
+    """Tangential and sagittal MTF (1, K) of a field (2, 1), whether of rays, and the function that makes its limit.
 
     memo: of its beam at other sensors.
     """

@@ -1,4 +1,4 @@
-"""What figures of curves share: ruled panels, titles and legends, and the curves of every wavelength or field."""
+"""Panels of figures of curves: rulers, titles and legends, and the curves of every wavelength or field."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -76,7 +76,7 @@ def marks(panel: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> None:
 
 
 def over_field(panel: Axes, curves: Analysis, values: np.ndarray, **options: Any) -> None:
-    """Curves (F, W) with the field upwards, as lens designers draw them; options: as for `by_wavelength`."""
+    """Curves (F, W) with the field upwards, as is usual in lens design; options: as for `by_wavelength`."""
     ruled(panel)
     order = np.argsort(field_axis(curves), kind="stable")
     field = field_axis(curves)[order]
@@ -97,7 +97,7 @@ def seen(values: Tensor, valid: Tensor) -> np.ndarray:
 
 
 def drawn_at_least(axes: Iterable[Axes], floor: float, along: str) -> None:
-    """Keep axes of one scale from magnifying rounding: where no curve passes the floor, they end there and say so."""
+    """Keep axes from magnifying rounding: where no curve exceeds the floor, the axes end there, with a note."""
     panels = list(axes)
     curves = [line for panel in panels for line in panel.lines if not str(line.get_label()).startswith("_")]
     drawn = [getattr(line, f"get_{along}data")() for line in curves]

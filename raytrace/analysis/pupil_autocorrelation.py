@@ -7,7 +7,7 @@ that is lit evenly. W and p are polynomials of s that fit the rays of a few ring
 pupils cover is cut into lines along the shear from rim to rim, with Gaussian rules along and across: their error falls
 exponentially with their points, where cells of a grid err by their share at the rim.
 
-Derivatives are exact of what is computed: backward from the OTFs to the polynomials, by torch, and by the normal
+Derivatives are exact for the computed numbers: backward from the OTFs to the polynomials, by torch, and by the normal
 equations from these to the rays, whose derivatives by the variables come from the trace.
 
 Source: Hopkins, Proc. Phys. Soc. B 70, 1957 (the sheared pupil); Golub & Pereyra 1973 (derivative of a fit).
@@ -227,11 +227,11 @@ def _afford_time(scene: Scene, rays: int, seconds: float | None) -> None:
     """Raise TooManyPoints where a trace takes more than `seconds`; warn TakesLong of a long one without these."""
     aimed = 4 if scene.lens.ray_aiming == "real" else 1
     needed = rays * len(scene.lens.surfaces) * aimed * _SURFACE_SECONDS
-    what = f"the blur needs a grid of {rays:,} rays"
+    need = f"the blur needs a grid of {rays:,} rays"
     if seconds is None:
-        forewarn(needed, what, helps="use geometric rays")
+        forewarn(needed, need, helps="use geometric rays")
     elif needed > seconds:
-        raise TooManyPoints(f"{what}, {needed:.0f} s: focus the lens, or use geometric rays")
+        raise TooManyPoints(f"{need}, {needed:.0f} s: focus the lens, or use geometric rays")
 
 
 def _orders(degree: int) -> list[zernike.Order]:
@@ -360,7 +360,7 @@ _WHOLE = 1.98  # of pupil radii: a shear that leaves nothing in common
 class Layout(NamedTuple):
     """Rays of a beam: pupil points (2, R), their weights (R,), and powers (i, j) of s_x and s_y of the fit.
 
-    half: of a beam that is mirrored in the y axis its right half, by what is even in x, and p_x by what is odd.
+    half: the right half of a beam that is symmetric about the y axis; W and p_y are even in x, p_x is odd.
     """
 
     points: np.ndarray
@@ -370,7 +370,7 @@ class Layout(NamedTuple):
 
     @property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of W and p_y, and of p_x: (K, 2) each."""
+        """The powers of W and p_y, and of p_x: (K, 2) each."""
         every = np.array([(i, n - i) for n in range(self.degree + 1) for i in range(n + 1)])
         even, odd = (every[every[:, 0] % 2 == parity] if self.half else every for parity in (0, 1))
         return even, odd
@@ -390,10 +390,10 @@ def layout_of(degree: int, *, half: bool) -> Layout:
 
 
 class Fit:
-    """Polynomials (B, N, N) of W, p_x and p_y in directions, and how they follow what they fit.
+    """Polynomials (B, N, N) of W, p_x and p_y in directions, and their derivatives by the fitted rays.
 
-    s = middle + scale * (u, v), which puts the beam into a square; `middle` and `scale` (2, B) are choices, which
-    nothing depends on.
+    s = middle + scale * (u, v), which puts the beam into a square; `middle` and `scale` (2, B) are choices without
+    effect on the polynomials in s.
     """
 
     def __init__(self, layout: Layout, wave: np.ndarray, directions: np.ndarray):
@@ -416,7 +416,7 @@ class Fit:
 
     @property
     def missed(self) -> np.ndarray:
-        """RMS (B,) in waves of what the polynomials of W leave."""
+        """RMS (B,) in waves of the residual of the polynomials of W."""
         return np.sqrt((self.layout.weights * self.parts[2].left ** 2).sum(-1) / self.layout.weights.sum())
 
     def by_rays(self, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -101,7 +101,7 @@ Shown = TypeVar("Shown", bound=Analysis)
 
 
 def shown(result: Shown) -> Shown:
-    """A result that has a number to show. Raises NothingToShow if there is none."""
+    """The result. Raises NothingToShow if all its numbers are undefined."""
     values = flat({name: column for name, column in result.columns().items() if name not in _HEADS})
     if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
         raise NothingToShow(

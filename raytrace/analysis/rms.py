@@ -51,7 +51,7 @@ class RmsOverField(OverField):
 
     @property
     def quantity(self) -> str:
-        """What the RMS is of, "wavefront" or "spot"."""
+        """The quantity of the RMS, "wavefront" or "spot"."""
         return "spot" if self.strehl is None else "wavefront"
 
     def columns(self) -> dict[str, Tensor]:

@@ -154,9 +154,9 @@ def seidel(
     need_axis(lens, "Seidel's theory", instead)
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
-            what = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
-            what = what if surface.phase is None else f"is {named(surface.phase)}"
-            raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r; {instead}")
+            defect = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
+            defect = defect if surface.phase is None else f"is {named(surface.phase)}"
+            raise ValueError(f"surface {number} {defect}: Seidel's theory is of even powers of r; {instead}")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)

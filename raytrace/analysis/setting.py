@@ -37,7 +37,7 @@ class Incomplete(RaytraceWarning):
 def setting(
     lens: Lens, fields: Points, wavelengths: Numbers, *, samples: int | None = None, every: bool = False
 ) -> tuple[Lens, Tensor]:
-    """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
+    """The lens at the wavelengths of an analysis, of equal weight and the first of them primary, and its fields (2, F).
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
     of those listed, or from `every` one, see `check_reach`; of batches of lenses and inside transforms of torch.func
@@ -99,7 +99,7 @@ def field_words(lens: Lens, field: Tensor) -> str:
 
 
 def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, quantity: str) -> None:
-    """Raise EmptySpot that names the first field (2, F) and wavelength without light, and where its rays end.
+    """Raise EmptySpot, with the first field (2, F) and wavelength without light and the ends of its rays.
 
     lit: (F, W); quantity: that is not defined there.
     """

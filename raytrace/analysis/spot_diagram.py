@@ -35,8 +35,8 @@ from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, ima
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
-_KERNELS = 64  # whose clear pupils are found at once
-_TRIED = 4096  # rays from which the cause is found where all fail
+_KERNELS = 64  # whose clear pupils are searched at once
+_TRIED = 4096  # rays that are traced again for the cause where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
 _INSET = 0.395  # of a panel's width
@@ -46,7 +46,7 @@ _REFERENCES, _WEIGHTS = ("centroid", "chief"), ("area", "equal")
 
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with what a `Spot` has.
+    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with the numbers of a `Spot`.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.

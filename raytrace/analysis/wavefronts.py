@@ -143,9 +143,9 @@ def wavefront(
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
     fields: y or (x, y); wavelengths: µm; size: pixels across a map; terms: number of Zernike terms, 37 by default;
-    numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. What a
-    wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the light
-    fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
+    numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. Undefined
+    numbers are nan: all of them where no ray arrives, the coefficients, with a warning, where the light fills too
+    little of the pupil. Raises budget.OverBudget for more points than memory holds.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     F, W = fields.shape[1], len(lens.wavelengths)
@@ -217,7 +217,7 @@ def _strehl(view: Scene) -> Tensor:
     for field in view.fields.split(1, 1):
         try:
             ratios.append(strehl(Scene(view.lens, field, view.wavelengths)))
-        except ValueError:  # a map of so many waves is still worth seeing
+        except ValueError:  # a map of so many waves is still shown
             ratios.append(view.wavelengths.new_full((view.shape[0], 1, view.shape[2]), torch.nan))
     return torch.cat(ratios, 1)
 

@@ -37,7 +37,7 @@ INVISIBLE_COLOURS = ("#7a1f1f", "#525252", "#8c6d31", "#5e3c99", "#1b6f6a", "#b0
 GLASS_COLOURS = ("#e9f2f8", "#86b3d1")  # at n = 1.4 and n = 2.0
 WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
 
-#: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
+#: Formats of `save` by suffix, with the metadata that would otherwise differ from file to file.
 SUFFIXES: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 _PNG = {"compress_level": 4}  # of zlib; its default, 6, takes a fifth longer to save a figure, for 1 to 10 % less
 
@@ -83,7 +83,7 @@ def styled(function: Callable[Arguments, Drawn]) -> Callable[Arguments, Drawn]:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure of width × height inches on a canvas of its own, which a notebook shows."""
+    """A figure of width × height inches with a canvas, which a notebook shows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

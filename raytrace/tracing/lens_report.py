@@ -69,7 +69,7 @@ def remarks(surface: Surface) -> list[str]:
 
 
 def entries(surface: Surface) -> dict:
-    """The kind of sag, the sag terms, the phase and the poses of a surface for a document; empty for a plain surface."""
+    """The kind of sag, sag terms, phase and poses of a surface for a document; empty for a plain surface."""
     document: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
     for name, part in (("sag_terms", surface.sag_terms), ("phase", surface.phase)):
         if part is not None:

@@ -294,7 +294,7 @@ def wave_psf(
         fixed |= {"design_wavelength": design_wavelength}
         fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, diameter) else aperture}
         if option := next((option for option, number in fixed.items() if number is not None), ""):
-            raise ValueError(f"`{option}` belongs to an element by name or from a file; an Element has its own")
+            raise ValueError(f"`{option}` belongs to an element by name or from a file; an Element has it already")
         name = " + ".join(part.kind.words for part in parts)
     for material in {id(part.glass.coefficients): part.glass for part in parts}.values():
         check_unit(torch.tensor(wavelengths), [material])

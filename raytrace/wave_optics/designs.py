@@ -21,7 +21,7 @@ from raytrace.maths.zernike import noll, norm
 from raytrace.wave_optics.element import ETCHED, TURNED, Element, EvenPowers, Rings, Zernike, fabricated_height, period
 from raytrace.wave_optics.fabrication import as_rings, features, wrapped
 
-#: How steep a sphere may be, (R/z)², for its series to be worth summing.
+#: The steepest sphere, (R/z)², whose series is summed.
 _STEEPEST = 0.8
 #: Object distances of the multifocal lens, mm: 2, 1.5, 1, 0.5 and 0 dioptres.
 FOCI = (500.0, 2000 / 3, 1000.0, 2000.0, math.inf)
@@ -245,7 +245,7 @@ _DESIGNS = ideal, singlet, fresnel, multifocal, multifocal_refractive, cubic, cu
 #: Name -> (aim, options) -> elements in contact.
 BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {f.__name__.replace("_", "-"): f for f in _DESIGNS}
 
-#: Those that can have steps of a wave.
+#: Designs that can have steps of a wave.
 STEPPED = tuple(name for name, design in BASELINES.items() if "levels" in inspect.signature(design).parameters)
 
 

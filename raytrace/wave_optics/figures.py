@@ -99,8 +99,8 @@ def psf_figure(psfs: Kernels) -> Figure:
 
 @styled
 def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
-    """The heights of elements in contact as they are made, a row for each: the disc, the profile along x, and the rim
-    of one that has steps."""
+    """The fabricated heights of elements in contact, a row for each: the disc, the profile along x, and the rim of an
+    element with steps."""
     figure = new_figure(7.6, 3.1 * len(elements))
     grid = figure.add_gridspec(2 * len(elements), 2, width_ratios=(1.15, 1.6))
     for row, element in enumerate(elements):

@@ -50,14 +50,14 @@ from raytrace.words import RaytraceError
 
 _MOST_RAYS = 400_000  # of one kernel
 
-_FINE = 32, 64  # of the points at which slopes of an element are looked for
+_FINE = 32, 64  # rings and arms of the points where slopes of an element are evaluated
 _PER_PIXEL = 8.0  # radians of phase that count for a flat pixel: two rays across it along a radius
 _PER_ZONE = 4.0  # times the phase of a wrapped height: twelve rays across a zone
 _WIDER = 1.05  # beam over element
 
 
 class TooCoarse(RaytraceError, ValueError):
-    """An element needs more rays than there can be."""
+    """An element needs more than 400,000 rays."""
 
 
 def element_lens(
@@ -279,7 +279,7 @@ def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:
 
 
 def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, ...]) -> float:
-    """By how many mm on the sensor rays spread farther with the elements, plus a distance that represents their steps.
+    """Additional spread (mm) of rays on the sensor by the elements, plus a distance that represents their steps.
 
     A slope g of path at the stop moves a ray of the lens, whose directions are (L, M) = -K s for points s of the stop,
     by K⁻ᵀ g/n on the sensor, with the K that fits the directions best; elements that focus make the blur smaller.
