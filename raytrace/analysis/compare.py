@@ -311,8 +311,8 @@ def _most_curved(lens: Lens) -> int:
     }
     if not strength:
         raise ValueError(
-            "the comparison of PSF models changes a conic, but no refracting or reflecting surface of this lens is curved; "
-            "ask for kernels of one model by `psf`"
+            "the comparison of PSF models changes a conic, but no refracting or reflecting surface of this lens is "
+            "curved; ask for kernels of one model by `psf`"
         )
     return max(strength, key=strength.__getitem__)
 
