@@ -350,7 +350,8 @@ def with_numbers(
 def _turned(row: _Row, numbers: Sequence[Tensor]) -> Surface:
     entries = list(numbers[row.coefficients : row.coefficients + row.terms])
     rotation = torch.stack([torch.stack(entries[3 * i : 3 * i + 3]) for i in range(3)])
-    return Surface(entries[12], before=Turn(rotation, torch.stack(entries[9:12]), entries[12]), is_break=True)
+    turn = Turn(rotation, torch.stack(entries[9:12]), entries[12])
+    return Surface(entries[12], before=turn, is_break=True)  # type: ignore[arg-type]  # a surface of the trace alone
 
 
 def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:

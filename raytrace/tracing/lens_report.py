@@ -14,7 +14,7 @@ from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
 from raytrace.system.phases import IdealLens, Phase
-from raytrace.system.poses import Pose, Turn
+from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import SagTerms
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, vertex_curvature
@@ -90,7 +90,7 @@ def _pose(pose: Pose | None) -> list[str]:
     return parts[::-1] if pose.tilts_first else parts
 
 
-def _fields(part: SagTerms | Phase | Pose | Turn) -> dict:
+def _fields(part: SagTerms | Phase | Pose) -> dict:
     """The fields of a value that are not None, tensors as numbers."""
     document = {}
     for field in dataclasses.fields(part):
