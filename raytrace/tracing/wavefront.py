@@ -196,11 +196,6 @@ def _from_bent_pupil(scene: Scene, centre: Tensor, direction: Tensor) -> Tensor:
     return torch.where(finite & (radius != 0), radius, torch.inf)
 
 
-def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """Mean OPD (D, F, W) in mm over the light that arrives; empty: its value where none arrives, see `spot_of`."""
-    return where_lit(_is_lit(wavefront), (_share(wavefront) * wavefront.opd).sum(-1), empty=empty)[0]
-
-
 def rms(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
     """RMS of the OPD about its mean (D, F, W), mm; empty: its value where no light arrives, see `spot_of`."""
     share = _share(wavefront)
