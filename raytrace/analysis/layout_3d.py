@@ -18,9 +18,9 @@ from raytrace.tracing.geometry import Frame, frames
 
 _RINGS, _ARMS, _TILES = 6, 48, 80  # of the mesh of a surface; of obscurations across it
 _LEAD = 0.14  # of the size of the system: rays of a far object start at this distance in front of it
-Colour = str | tuple[float, ...]
-
 _MIRROR = "#b9c2ca"
+
+Colour = str | tuple[float, ...]
 
 
 def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> style.Figure:

@@ -351,10 +351,10 @@ def _traced(scene: Scene, pupil: Tensor, radius: Tensor) -> tuple[Tensor, Tensor
 
 _RIM = 1 - 1e-9  # rays of the rim, which rounding must not put outside
 _NEWTON = 12  # steps at the most
-
-Pair = tuple[Tensor, Tensor]
 _CLOSE = 1e-7  # of the pupil, from where one more step ends at rounding
 _WHOLE = 1.98  # of pupil radii: a shear that leaves nothing in common
+
+Pair = tuple[Tensor, Tensor]
 
 
 class Layout(NamedTuple):

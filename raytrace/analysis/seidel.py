@@ -35,9 +35,9 @@ _SEIDEL = {
     "C2": "lateral colour", "W040": "spherical", "W131": "coma", "W222": "astigmatism", "W220P": "Petzval",
     "W311": "distortion", "W020": "axial colour", "W111": "lateral colour",
 }  # fmt: skip
-Pair = tuple[Number, Number]
-
 _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
+
+Pair = tuple[Number, Number]
 
 
 @value

@@ -641,8 +641,8 @@ def _axial_basis(degree: int, radius: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _disc_nodes(degree: int, mirrored: bool) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
-    """Points (2, ...) traced to fit and to check; of mirrored light, for each ring point the traced one and its sign in
-    x."""
+    """Points (2, ...) traced to fit and to check; of mirrored light, the traced point and its sign in x for each ring
+    point."""
     rings = _rings(degree)
     step = np.arange(_CHECKS)
     radius, angle = np.sqrt((step + 1) / _CHECKS), np.pi * (3 - 5**0.5) * step + 0.3
