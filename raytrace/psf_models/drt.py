@@ -390,7 +390,7 @@ def kernels_of_points(
 ) -> Kernels:
     """Kernels of independent rays through pupil points (2, P), all of one weight, 1/rays; rays: P by default."""
     traced, rays = trace_scene(scene, disc), disc.shape[1] if rays is None else rays
-    energy = torch.where(traced.valid, 1 / rays, 0.0).expand(*scene.shape, -1)
+    energy = (traced.valid.to(traced.position) / rays).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]

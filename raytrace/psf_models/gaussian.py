@@ -419,7 +419,7 @@ def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
     """Gaussians of the rays through pupil points (2, P), all of one weight: their centroid and covariance, not those of
     all light."""
     traced = trace_scene(scene, points)
-    arrives = torch.where(traced.valid, 1 / points.shape[1], 0.0).expand(*scene.shape, -1)
+    arrives = (traced.valid.to(traced.position) / points.shape[1]).expand(*scene.shape, -1)
     centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
     # Points with their mirror images in x have no covariance xy but for rounding, which would cost a quadrature.
     mirrored = points * points.new_tensor([[-1.0], [1.0]])

@@ -272,7 +272,7 @@ def wave_psf(
     """
     if isinstance(element, str | os.PathLike):
         name = str(element)
-        parts = elements(
+        parts = phase_elements(
             element,
             aperture=aperture,
             sensor=sensor,
@@ -313,7 +313,7 @@ def wave_psf(
     return ElementPsf(kernel, scene, chosen, name, axial[0][..., 0, 0] if axial else None)
 
 
-def elements(
+def phase_elements(
     element: str | os.PathLike = "singlet",
     *,
     aperture: float = 5.0,
