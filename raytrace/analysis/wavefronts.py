@@ -82,7 +82,7 @@ class WavefrontMap(Analysis):
         for field, values in zip(self.fields.T, self.coefficients, strict=True) if self.listed else ():
             terms = range(1, values.shape[-1] + 1)
             n, m = zip(*map(order, terms), strict=True)
-            columns: dict[str | Column, Tensor | Sequence] = {
+            columns: dict[Any, Tensor | Sequence] = {
                 Column("j"): terms,
                 Column("n"): n,
                 Column("m"): m,

@@ -567,10 +567,11 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
         return ""
     if fields.shape[1] > MOST_FIELDS:
         fields = fields[:, [*_spread(fields.shape[1], MOST_FIELDS), int(fields.norm(dim=0).argmax())]]
-    if lens.count == 0:
+    count = lens.count
+    if count == 0:
         return ""
-    if (lens.count or 1) > MOST_LENSES:
-        lens = one_lens(lens, torch.tensor(_spread(lens.count, MOST_LENSES), device=lens.wavelengths.device))
+    if count is not None and count > MOST_LENSES:
+        lens = one_lens(lens, torch.tensor(_spread(count, MOST_LENSES), device=lens.wavelengths.device))
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most

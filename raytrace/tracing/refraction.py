@@ -29,7 +29,7 @@ def refract(
     direction: Vector,
     normal: Vector,
     cosine: Tensor,
-    norm_squared: Tensor,
+    norm_squared: Tensor | float,
     n1: Tensor,
     n2: Tensor,
     b_squared: Tensor | None = None,
@@ -52,7 +52,7 @@ def refract(
     return _renormalise(refracted), passes
 
 
-def reflect(direction: Vector, normal: Vector, cosine: Tensor, norm_squared: Tensor) -> list[Tensor]:
+def reflect(direction: Vector, normal: Vector, cosine: Tensor, norm_squared: Tensor | float) -> list[Tensor]:
     """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
     twice = 2 * cosine / norm_squared
     return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
@@ -62,7 +62,7 @@ def diffract(
     direction: Vector,
     normal: Vector,
     cosine: Tensor,
-    norm_squared: Tensor,
+    norm_squared: Tensor | float,
     n1: Tensor,
     n2: Tensor,
     added: Added,
