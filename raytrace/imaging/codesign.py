@@ -32,9 +32,9 @@ from raytrace.imaging.closed_form import (
     out_of_focus,
     patch_spectrum,
 )
+from raytrace.imaging.image import decoded
 from raytrace.imaging.network import RedNetShape, UNetShape, network
 from raytrace.imaging.pictures import Pictures, crop, draws
-from raytrace.imaging.render import decoded
 from raytrace.imaging.restoration import psnr, restore, restore_jointly
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
