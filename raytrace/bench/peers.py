@@ -210,7 +210,8 @@ def psf_methods(truth: Truth) -> list[Method]:
         be.set_backend("numpy")
         kernel, count = compute(optic, field, wavelength, grid, *sizes)
         kernel = torch.as_tensor(np.ascontiguousarray(kernel) * (energy / kernel.sum()))
-        return Kernels(kernel, grid, None, None, count)
+        unknown = kernel.new_full((3,), torch.nan)
+        return Kernels(kernel, grid, unknown[:2], unknown, count)
 
     methods = []
     for model, against, compute, sampling, choices in _PSFS:

@@ -636,7 +636,7 @@ def with_sensor_distance(lens: Lens, sensor_distance: Tensor | float) -> Lens:
 
 
 def with_wavelengths(
-    lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None, *, where: str = ""
+    lens: Lens, wavelengths: Tensor | Sequence[float] | float, weights: Tensor | None = None, *, where: str = ""
 ) -> Lens:
     """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default.
 

@@ -18,7 +18,7 @@ from raytrace.materials.glass import AIR, Glass
 from raytrace.maths.numerics import Number, is_any, value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
-from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first, without_z
+from raytrace.system.poses import Gap, Pose, decentred_first, tilted_first, without_z
 from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
 from raytrace.system.shapes import EVEN, KINDS, conic_terms
 
@@ -54,7 +54,7 @@ class Surface:
     kind: str = EVEN
     sag_terms: SagTerms | None = None
     phase: Phase | None = None
-    before: Pose | Turn | None = None
+    before: Pose | None = None
     after: Pose | None = None
     is_break: bool = False
     glass: Glass = AIR
