@@ -88,7 +88,7 @@ PUBLIC = {
     "Merit": "optimization.merit",
     "Conventions": "optimization.operands.operand",
     "NoProblem": "optimization.problem",
-    "Optimized": "optimization.optimize",
+    "Optimized": "optimization.optimized",
     "Row": "system.optimization_data",
     "Vary": "system.optimization_data",
     "evaluate": "optimization.evaluate",

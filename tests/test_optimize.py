@@ -15,7 +15,7 @@ import raytrace as rt
 from raytrace.optimization import least_squares as paths
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOptions, State, least_squares
 from raytrace.optimization.merit import DefaultMerit
-from raytrace.optimization.optimize import optimize_report
+from raytrace.optimization.optimized_figure import optimize_report
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
 from raytrace.optimization.variables import design_variables, name_of
 from raytrace.system.optimization_data import OptimizationData, Row, Vary

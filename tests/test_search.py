@@ -16,8 +16,8 @@ import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
+from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
-from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
 from raytrace.optimization.search import Minima

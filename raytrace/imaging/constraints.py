@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from raytrace.materials.glass import Glass
+from raytrace.optimization.attained import EXACT, NotReached
 from raytrace.optimization.glass_choice import Pool
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, State
-from raytrace.optimization.optimize import EXACT, NotReached
 from raytrace.optimization.problem import Condition, Problem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens

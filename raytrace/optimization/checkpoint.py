@@ -80,14 +80,14 @@ class Checkpoint:
     where glasses vary, and with "evaluated" in the place of "descent" for a merit that is not a sum of squares.
     """
 
-    def __init__(self, path: str | PathLike | None, of: Mapping, names: Sequence[str]):
-        self.store = None if path is None else Document(path, of, _CHECKPOINT)
-        self.names, self.last, self.more = names, -np.inf, {}
+    def __init__(self, path: str | PathLike, about: Mapping[str, object], names: Sequence[str]):
+        self.store, self.names, self.last = Document(path, about, _CHECKPOINT), names, -np.inf
+        self.of_glasses: dict[str, object] = {}
 
     def write_glasses(self, stored: Stored, merit: float) -> None:
         """Write a state of the choice of glasses; later states repeat these glasses."""
         glasses = {str(k): list(glass) for k, glass in stored.glasses.items()}
-        self.more = {"glasses": glasses, "tested": list(stored.tested)}
+        self.of_glasses = {"glasses": glasses, "tested": list(stored.tested)}
         self.write(stored.x, merit, 0, now=True)
 
     def write(
@@ -104,10 +104,10 @@ class Checkpoint:
 
         Warns NotWritten where the file cannot be written; the optimisation continues.
         """
-        if self.store is None or (not now and time.monotonic() < self.last + EVERY):
+        if not now and time.monotonic() < self.last + EVERY:
             return
         variables = dict(zip(self.names, x.tolist(), strict=True))
-        document = {"merit": merit, "cycles": cycles, "variables": variables, **self.more}
+        document: dict[str, object] = {"merit": merit, "cycles": cycles, "variables": variables, **self.of_glasses}
         if descent is not None:
             state = descent.solver
             document["descent"] = {
@@ -130,7 +130,7 @@ class Checkpoint:
         self.last = time.monotonic()
 
 
-def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> Stored:
+def read_checkpoint(path: str | PathLike, about: Mapping[str, object], names: Sequence[str]) -> Stored:
     """The checkpoint of this optimisation. Raises BadCheckpoint and OSError."""
     finite, entry = listed(number(), len(names), len(names)), either(exactly(None), number(infinite=True))
     columns = (whole(), *(number(0),) * 4, whole(), number(), text)
@@ -188,22 +188,19 @@ def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> 
             np.array(document.get("evaluated", []), dtype=float),
         )
 
-    return Document(path, of, _CHECKPOINT).read(check)
+    return Document(path, about, _CHECKPOINT).read(check)
 
 
 class Log:
     """A file of comma-separated values, a line for every cycle; rewritten with the cycles so far."""
 
-    def __init__(self, path: str | PathLike | None, cycles: Sequence[Cycle] = ()):
-        self.store = None
-        if path is not None:
-            self.store, self.table = Store(path, {}, _LOG), Table(path)
-            self.table.begin(_COLUMNS, *map(_cells, cycles))
+    def __init__(self, path: str | PathLike, cycles: Sequence[Cycle] = ()):
+        self.store, self.table = Store(path, {}, _LOG), Table(path)
+        self.table.begin(_COLUMNS, *map(_cells, cycles))
 
     def add(self, cycle: Cycle) -> None:
         """Add a cycle. Warns NotWritten where the file cannot be written; the optimisation continues."""
-        if self.store is not None:
-            self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
+        self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
 
 
 def _cells(cycle: Cycle) -> list:

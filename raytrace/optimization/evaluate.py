@@ -233,8 +233,7 @@ def evaluate(
     ]
     if lens.count is not None:
         return _of_batch(lens, function, shown)
-    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluation = Evaluation(DesignVariables(lens), function.rows, **options)
+    evaluation = Evaluation(DesignVariables(lens), function.rows, **function.options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
     return MeritResult(
         lens=lens,

@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from graphlib import CycleError, TopologicalSorter
 from numbers import Integral
+from typing import TypedDict
 
 import numpy as np
 
@@ -257,6 +258,14 @@ KINDS = {
 # -- merit functions as values -----------------------------------------------------------------------------------------
 
 
+class RowOptions(TypedDict):
+    """Options of the evaluation of rows, as of `Evaluation`."""
+
+    unit: float
+    skip_unknown: bool
+    conventions: Conventions | None
+
+
 @dataclass(frozen=True)
 class Merit:
     """Rows of a merit function, in order; `rows[i - 1]` is row i.
@@ -304,6 +313,11 @@ class Merit:
     def default(cls, lens: Lens, kind: str = "spot", **settings) -> "Merit":
         """A default merit function of the lens, in mm; settings: those of `DefaultMerit`."""
         return merit_for(lens, DefaultMerit(kind, **settings))
+
+    @property
+    def options(self) -> RowOptions:
+        """The options of the evaluation of these rows."""
+        return {"unit": self.unit, "skip_unknown": self.skip_unknown, "conventions": self.conventions}
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -35,8 +35,7 @@ class MeritOfBatch:
         self.by = tuple(k for k, column in enumerate(columns) if column.requires_grad)
         self.numbers = torch.stack(columns, -1) if columns else lens.wavelengths.new_zeros(self.count, 0)
         model = DesignVariables(first, variables=tuple(Vary(*address) for address in self.addresses))
-        options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-        self.evaluation = Evaluation(model, function.rows, **options)
+        self.evaluation = Evaluation(model, function.rows, **function.options)
 
     def evaluated(self) -> list[Evaluated]:
         """The merit function of each lens, without derivatives."""

@@ -24,9 +24,12 @@ from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table
+from raytrace.optimization.attained import conditions_attained
+from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
-from raytrace.optimization.optimize import conditions_at, drawn_fields, opened, refuse_contradictions
+from raytrace.optimization.opening import opened
+from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
     Condition,
     ExpectationSettings,
@@ -233,9 +236,10 @@ def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: 
     ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
     if ends:
         nearest = min(ends, key=lambda end: end.rank)
-        missed = [one for one in conditions_at(task.whole, nearest.x) if not one.met]
+        conditions = conditions_attained(task.whole, task.whole.evaluated(nearest.x))
+        missed = [condition for condition in conditions if not condition.met]
         rays = [f"failing rays in {nearest.lost:g} rows"] if nearest.lost else []
-        words = ", ".join([*rays, *(f"{one.words} at {one.reached:.6g}" for one in missed)])
+        words = ", ".join([*rays, *(f"{condition.words} at {condition.reached:.6g}" for condition in missed)])
         place = ""
         if folder is not None:
             path = Path(folder) / NEAREST
@@ -358,8 +362,7 @@ def search(
         )
     glass, air = function.boundaries.glass, function.boundaries.air
     ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
-    settings = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    task = SearchProblem(free, tuple(function.rows), conditions, ends, glass, air, settings)
+    task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
     until = started + (np.inf if seconds is None else seconds)
     surfaces = ()
     if insert is not None and insert is not False:

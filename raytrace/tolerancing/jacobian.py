@@ -220,6 +220,5 @@ def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> 
 def _of_merit(model: DesignVariables, lens: Lens, merit) -> tuple[Tensor, Tensor]:
     """The residuals (m,) of a merit function, whose squares sum up to M², and their derivatives (n, m)."""
     function = merit_for(lens, merit)
-    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluated = Evaluation(model, function.rows, **options)(model.start, derivatives=True)
+    evaluated = Evaluation(model, function.rows, **function.options)(model.start, derivatives=True)
     return torch.from_numpy(evaluated.residuals), torch.from_numpy(evaluated.jacobian.T.copy())
