@@ -24,7 +24,7 @@ from raytrace.optimization.glass_choice import (
     hull,
     pool_of,
 )
-from raytrace.optimization.least_squares import Sides, State, least_squares
+from raytrace.optimization.least_squares import Sides, SumOfSquares, least_squares
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.variables import design_variables, without_glass
@@ -109,7 +109,7 @@ def test_the_expansion_of_a_linear_merit_predicts_the_minimum():
     draw = np.random.default_rng(2)
     J, r = draw.normal(size=(30, 7)), draw.normal(size=30)
     A, c = draw.normal(size=(1, 7)), draw.normal(size=1)
-    state = State(np.zeros(7), r, 0, Sides.none(7), c, NONE, J, A, np.zeros((0, 7)))
+    state = SumOfSquares(np.zeros(7), r, 0, Sides.none(7), c, NONE, J, A, np.zeros((0, 7)))
     foretold = expansion(state, np.array([5, 6]), np.arange(5), np.zeros((0, 7)))
     for d in draw.normal(size=(5, 2)):
         system = np.block([[J[:, :5].T @ J[:, :5], A[:, :5].T], [A[:, :5], np.zeros((1, 1))]])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raytrace.maths.result import plain
-from raytrace.optimization.least_squares import PATHS, Cycle, PathState, SolverState
+from raytrace.optimization.least_squares import PATHS, Cycle, CycleStart, PathProgress
 from raytrace.stores import (
     Document,
     Kind,
@@ -57,7 +57,7 @@ class Stored(NamedTuple):
     x: np.ndarray
     glasses: dict[int, tuple[str, str]]
     tested: tuple[int, ...] = ()
-    descent: PathState | None = None
+    descent: PathProgress | None = None
     evaluated: np.ndarray = np.zeros((0, 0))
 
 
@@ -96,7 +96,7 @@ class Checkpoint:
         merit: float,
         cycles: int,
         *,
-        descent: PathState | None = None,
+        descent: PathProgress | None = None,
         evaluated: Sequence[np.ndarray] = (),
         now: bool = False,
     ) -> None:
@@ -125,7 +125,7 @@ class Checkpoint:
                 "history": [list(dataclasses.astuple(cycle)) for cycle in descent.history],
             }
         if evaluated:
-            document["evaluated"] = [plain(one.tolist()) for one in evaluated]
+            document["evaluated"] = [plain(evaluation.tolist()) for evaluation in evaluated]
         self.store.write(document)
         self.last = time.monotonic()
 
@@ -159,18 +159,18 @@ def read_checkpoint(path: str | PathLike, about: Mapping[str, object], names: Se
     of_paths = {"path": whole(0, len(PATHS) - 1), "start": vector, "best": either(exactly(None), best)}
     descent_of = record({**of_paths, **of_solver, "before": listed(whole(), 2, 2), "history": listed(cycle)})
 
-    def descent(value: object) -> PathState:
+    def descent(value: object) -> PathProgress:
         stored = descent_of(value)
         (before, evaluations), history = stored["before"], stored["history"]
         if before > len(history):
             raise Unfit("history: expected the cycles of every path")
         cycles = tuple(
-            dataclasses.replace(one, number=one.number - before, evaluations=one.evaluations - evaluations)
-            for one in history[before:]
+            dataclasses.replace(cycle, number=cycle.number - before, evaluations=cycle.evaluations - evaluations)
+            for cycle in history[before:]
         )
-        solver = SolverState(cycles=cycles, **{name: stored[name] for name in of_solver})
+        solver = CycleStart(cycles=cycles, **{name: stored[name] for name in of_solver})
         paths = {name: stored[name] for name in of_paths}
-        return PathState(solver=solver, before=tuple(history[:before]), evaluations=evaluations, **paths)
+        return PathProgress(solver=solver, before=tuple(history[:before]), evaluations=evaluations, **paths)
 
     def check(value: object) -> Stored:
         document = record({}, {"descent": descent})(document_of(value))

@@ -202,9 +202,9 @@ def _of_batch(lens: Lens, function: Merit, shown: list[int]) -> MeritsOfBatch:
         merit=safe_sqrt(merits.square()),
         function=function.rows,
         row=torch.tensor([k + 1 for k in shown], dtype=torch.int64),
-        values=torch.as_tensor(np.stack([one.values[shown] for one in each])),
-        contributions=torch.as_tensor(np.stack([one.contributions(shown) for one in each])),
-        lost=torch.as_tensor(np.stack([one.lost[shown] for one in each])),
+        values=torch.as_tensor(np.stack([evaluated.values[shown] for evaluated in each])),
+        contributions=torch.as_tensor(np.stack([evaluated.contributions(shown) for evaluated in each])),
+        lost=torch.as_tensor(np.stack([evaluated.lost[shown] for evaluated in each])),
         unit=function.unit,
     )
 
@@ -227,7 +227,7 @@ def evaluate(
         warn_of_filling(lens, field_points(None, like=lens))
     of_rows = configurations_of(function, lens.current_configuration)
     if configuration is not None:
-        function = function.with_weights({k: 0.0 for k, at in enumerate(of_rows, 1) if at != configuration})
+        function = function.with_weights({k: 0.0 for k, of_row in enumerate(of_rows, 1) if of_row != configuration})
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
@@ -257,9 +257,9 @@ def _shares(result: MeritResult) -> dict[str, tuple[str, float]]:
     several = len({*result.configurations.tolist()}) > 1
     shares: dict[str, tuple[str, float]] = {}
     numbers = (result.row, result.configurations, result.weights, result.contributions)
-    for row, number, at, weight, part in zip(result.valued(), *(n.tolist() for n in numbers), strict=True):
+    for row, number, configuration, weight, part in zip(result.valued(), *(n.tolist() for n in numbers), strict=True):
         if weight:
-            name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
+            name = f"{_name(number, row)}, conf. {configuration}" if several else _name(number, row)
             shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)
     return shares or {"no row has a weight": ("", 0.0)}
 

@@ -29,7 +29,7 @@ from scipy.spatial import ConvexHull, QhullError
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
-from raytrace.optimization.least_squares import State, least_squares
+from raytrace.optimization.least_squares import SumOfSquares, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
@@ -49,10 +49,10 @@ class Pool:
     def __init__(self, glasses: Sequence[Glass], wavelengths: torch.Tensor):
         self.wavelengths, self.basis = wavelengths, _basis(wavelengths)
         self.glasses = tuple(glasses)
-        found = np.array([self.numbers_of(glass) for glass in self.glasses]).reshape(-1, self.count)
-        usable = np.isfinite(found).all(1)
+        numbers = np.array([self.numbers_of(glass) for glass in self.glasses]).reshape(-1, self.count)
+        usable = np.isfinite(numbers).all(1)
         self.glasses = tuple(glass for glass, use in zip(self.glasses, usable, strict=True) if use)
-        self.numbers = found[usable]
+        self.numbers = numbers[usable]
         if not len(self.numbers):
             raise NoProblem("no glass of the catalogs covers the wavelengths of the lens; name others by `catalog`")
         self.normal, self.reach = hull(self.numbers)
@@ -69,8 +69,8 @@ class Pool:
     def numbers_of(self, glass: Glass) -> np.ndarray:
         """(k,) of the model glass whose indices come nearest at the wavelengths; as many of them are met exactly."""
         excess = refractive_index(glass, self.wavelengths).numpy() - 1
-        found = np.linalg.lstsq(self.basis, excess, rcond=None)[0]
-        n, dispersion, deviation = np.pad(found, (0, 3 - self.count))
+        coefficients = np.linalg.lstsq(self.basis, excess, rcond=None)[0]
+        n, dispersion, deviation = np.pad(coefficients, (0, 3 - self.count))
         if self.count == 1:
             return np.array([1 + n])
         return np.array([1 + n, n / dispersion, deviation / dispersion])[: self.count]
@@ -85,10 +85,10 @@ def _basis(wavelengths: torch.Tensor) -> np.ndarray:
 
     As many of the three, in this order, as change the index at the wavelengths independently.
     """
-    at = lambda *numbers: refractive_index(model_glass(*numbers), wavelengths).numpy() - 1  # noqa: E731
+    excess = lambda *numbers: refractive_index(model_glass(*numbers), wavelengths).numpy() - 1  # noqa: E731
     if len(wavelengths) == 1:
         return np.ones((1, 1))
-    whole, half, deviating = at(2.0, 1.0), at(2.0, 2.0), at(2.0, 1.0, 1.0)
+    whole, half, deviating = excess(2.0, 1.0), excess(2.0, 2.0), excess(2.0, 1.0, 1.0)
     basis = np.stack([2 * half - whole, 2 * (whole - half), deviating - whole], -1)[:, : len(wavelengths)]
     typical = np.array([0.6, 0.012, 1e-4])[: basis.shape[1]]
     new = np.abs(np.diag(np.linalg.qr(basis * typical)[1])) > _MATTERS
@@ -103,13 +103,13 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, size = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
     scaled = (points - low) / size
     try:
-        found = ConvexHull(scaled).equations
+        planes = ConvexHull(scaled).equations
     except (QhullError, ValueError):
         axes = np.eye(points.shape[1])
-        found = np.concatenate([np.c_[axes, -scaled.max(0)], np.c_[-axes, scaled.min(0)]])
-    found = np.unique(found.round(12), axis=0)
-    normal = found[:, :-1] / size
-    return normal, normal @ low - found[:, -1]
+        planes = np.concatenate([np.c_[axes, -scaled.max(0)], np.c_[-axes, scaled.min(0)]])
+    planes = np.unique(planes.round(12), axis=0)
+    normal = planes[:, :-1] / size
+    return normal, normal @ low - planes[:, -1]
 
 
 def catalogs_of(lens: Lens, catalog: Sequence[str | Path] = ()) -> tuple[Catalog, ...]:
@@ -131,13 +131,13 @@ def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
     """Glasses of STATUSES whose range covers the wavelengths of the lens. Raises NoProblem where there is none."""
     shortest, longest = float(lens.wavelengths.min()), float(lens.wavelengths.max())
     span = lambda glass: glass.wavelength_range or (0.0, np.inf)  # noqa: E731
-    found = [
+    glasses = [
         dataclasses.replace(glass, name=glass.listed_name or glass.name)
-        for one in catalogs
-        for glass in one.glasses.values()
+        for catalog in catalogs
+        for glass in catalog.glasses.values()
         if glass.status in STATUSES and span(glass)[0] <= shortest and longest <= span(glass)[1] and not is_air(glass)
     ]
-    return Pool(found, lens.wavelengths)
+    return Pool(glasses, lens.wavelengths)
 
 
 def charge(glass: Glass) -> float:
@@ -193,9 +193,9 @@ class GlassStep:
     tried: tuple[tuple[str, float, float], ...] = ()
 
     def document(self) -> dict:
-        named = {"surface": self.surface, "glass": self.name, "catalog": self.catalog, "predicted": self.predicted}
-        tried = [dict(zip(("glass", "predicted", "reached"), one, strict=True)) for one in self.tried]
-        more = {**named, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
+        of_surface = {"surface": self.surface, "glass": self.name, "catalog": self.catalog, "predicted": self.predicted}
+        tried = [dict(zip(("glass", "predicted", "reached"), trial, strict=True)) for trial in self.tried]
+        more = {**of_surface, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
         return {"step": self.kind, **more, "reached": self.reached, "seconds": round(self.seconds, 3)}
 
     @property
@@ -212,7 +212,7 @@ class Design:
 
     x: np.ndarray
     glasses: dict[int, Glass]
-    state: State
+    state: SumOfSquares
 
     @property
     def merit(self) -> float:
@@ -238,7 +238,7 @@ class Expansion:
         return np.sqrt(np.maximum(square, 0.0))
 
 
-def expansion(state: State, own: np.ndarray, following: np.ndarray, fixed: np.ndarray) -> Expansion:
+def expansion(state: SumOfSquares, columns_of_glass: np.ndarray, following: np.ndarray, fixed: np.ndarray) -> Expansion:
     """The merit by the variables `own` after `following` ones have followed, conditions met; numbers of columns.
 
     fixed: (h', n) slopes of limits that are met just so, and stay met.
@@ -249,7 +249,7 @@ def expansion(state: State, own: np.ndarray, following: np.ndarray, fixed: np.nd
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     back = np.linalg.pinv(A[:, following] / scale) if len(A) else np.zeros((len(following), 0))
     columns = columns / scale
-    r, steep = r - columns @ (back @ c), J[:, own] - columns @ (back @ A[:, own])
+    r, steep = r - columns @ (back @ c), J[:, columns_of_glass] - columns @ (back @ A[:, columns_of_glass])
     free = columns - columns @ (back @ (A[:, following] / scale))
     left, sizes, _ = np.linalg.svd(free, full_matrices=False)
     keep = np.sqrt(_DAMPING / (sizes**2 + _DAMPING))  # N² = (λ/(σ² + λ))² + ridge λ (σ/(σ² + λ))² = λ/(σ² + λ)
@@ -287,30 +287,33 @@ class Choice:
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
         """For every surface the glasses and their numbers: of the pool, and its own glass, if of a catalog."""
-        found = {}
+        candidates = {}
         for k in self.surfaces:
-            own, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
-            new = bool(own.catalog) and (own.listed_name or own.name, own.catalog) not in names
-            glasses = (*self.pool.glasses, own) if new else self.pool.glasses
-            numbers = [self.pool.numbers, self.pool.numbers_of(own)[None]] if new else [self.pool.numbers]
-            found[k] = glasses, np.concatenate(numbers)
-        return found
+            glass_of_lens, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
+            new = (
+                bool(glass_of_lens.catalog)
+                and (glass_of_lens.listed_name or glass_of_lens.name, glass_of_lens.catalog) not in names
+            )
+            glasses = (*self.pool.glasses, glass_of_lens) if new else self.pool.glasses
+            numbers = [self.pool.numbers, self.pool.numbers_of(glass_of_lens)[None]] if new else [self.pool.numbers]
+            candidates[k] = glasses, np.concatenate(numbers)
+        return candidates
 
     def run(self, x: np.ndarray, stored: Stored | None = None) -> Design:
         """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
-        own = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
+        glasses_of_lens = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
         if stored is not None and stored.glasses:
-            chosen = own | {k: self._named(k, *one) for k, one in stored.glasses.items()}
+            chosen = glasses_of_lens | {k: self._named(k, *stored_glass) for k, stored_glass in stored.glasses.items()}
             self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
             if stored.descent is None:  # else all exchanges were done
                 with suppress(KeyboardInterrupt):  # the best so far
                     self.swap(stored.tested)
             return self.best
-        first = self.descend(Design(x, own, None), (), self.cycles)
+        first = self.descend(Design(x, glasses_of_lens, None), (), self.cycles)
         self.steps.append(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
-            known = all(glass.catalog for glass in own.values())
+            known = all(glass.catalog for glass in glasses_of_lens.values())
             if known and time.monotonic() > self.until:
                 return first
             snapped = self.snapped(first, known=known)
@@ -371,11 +374,11 @@ class Choice:
             slope = np.vstack([slope, rows])
         reach = np.tile(self.pool.reach, len(open_))
 
-        def state(x: np.ndarray, derivatives: bool) -> State:
-            found = problem.state(x, derivatives)
-            limits = np.concatenate([found.limits, slope @ x - reach])
-            slopes = None if found.limits_slope is None else np.vstack([found.limits_slope, slope])
-            return dataclasses.replace(found, limits=limits, limits_slope=slopes)
+        def state(x: np.ndarray, derivatives: bool) -> SumOfSquares:
+            reached = problem.state(x, derivatives)
+            limits = np.concatenate([reached.limits, slope @ x - reach])
+            slopes = None if reached.limits_slope is None else np.vstack([reached.limits_slope, slope])
+            return dataclasses.replace(reached, limits=limits, limits_slope=slopes)
 
         return state
 
@@ -389,16 +392,16 @@ class Choice:
         rest = np.full(self.pool.count * len(open_), np.inf)
         lower, upper = np.concatenate([self.bounds[0], -rest]), np.concatenate([self.bounds[1], rest])
         start = np.clip(self._start(design, open_), lower, upper)
-        found = least_squares(state, start, lower=lower, upper=upper, cycles=cycles, until=self.until)
-        if found.stopped == "interrupted":
+        descent = least_squares(state, start, lower=lower, upper=upper, cycles=cycles, until=self.until)
+        if descent.stopped == "interrupted":
             raise KeyboardInterrupt
-        self.evaluations += found.evaluations
-        self.descended += len(found.cycles)
+        self.evaluations += descent.evaluations
+        self.descended += len(descent.cycles)
         count, k = len(self.model.variables), self.pool.count
-        end = found.state.x
+        end = descent.state.x
         numbers = {s: end[count + k * j : count + k * (j + 1)] for j, s in enumerate(open_)}
-        glasses = design.glasses | {s: self.pool.model(one) for s, one in numbers.items()}
-        return Design(end[:count], glasses, found.state)
+        glasses = design.glasses | {s: self.pool.model(of_glass) for s, of_glass in numbers.items()}
+        return Design(end[:count], glasses, descent.state)
 
     def predicted(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
         """For surfaces the predicted merits (G,) of their candidates; glasses of `open_` follow too."""
@@ -410,12 +413,12 @@ class Choice:
         columns = {s: np.arange(count + k * j, count + k * (j + 1)) for j, s in enumerate(self.surfaces)}
         inside = np.arange(count)[(design.x > self.bounds[0]) & (design.x < self.bounds[1])]
         held = len(state.limits) - len(self.pool.normal) * len(self.surfaces)
-        at = state.limits_slope[:held][np.abs(state.limits[:held]) < _MET]
+        limits_met = state.limits_slope[:held][np.abs(state.limits[:held]) < _MET]
         merits = {}
         for s in surfaces:
             following = np.concatenate([inside, *(columns[o] for o in open_ if o != s)]).astype(int)
             change = self.candidates[s][1] - self.numbers(design, s)
-            merits[s] = expansion(state, columns[s], following, at).merit(change)
+            merits[s] = expansion(state, columns[s], following, limits_met).merit(change)
         return merits
 
     def numbers(self, design: Design, surface: int) -> np.ndarray:

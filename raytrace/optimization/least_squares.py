@@ -97,17 +97,19 @@ class Linear:
         total = self.gradient + self.sides.slope.T @ pull
         _, free = _of_equalities(self.held[1], self.held[0])
         total = total - (total - free @ (free.T @ total))
-        at = self.least >= -_SLACK
-        if at.any():  # active inequalities carry the component that pushes against them
-            carried, _ = nnls(self.conditions[at].T, total)
-            total = total - self.conditions[at].T @ carried
+        active = self.least >= -_SLACK
+        if active.any():  # active inequalities carry the component that pushes against them
+            carried, _ = nnls(self.conditions[active].T, total)
+            total = total - self.conditions[active].T @ carried
         return float(np.abs(total).max(initial=0.0))
 
     def bend(self, second: np.ndarray, damping: float) -> np.ndarray:
         """-(JᵀJ + λ D²)⁻¹ of D⁻¹ Jᵀ r″, in the space that equalities and active bounds leave free."""
         _, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
-        at = self.least >= -_SLACK
-        _, free = _of_equalities(np.vstack([self.held[1], self.conditions[at]]), np.zeros(len(self.held[0]) + at.sum()))
+        active = self.least >= -_SLACK
+        _, free = _of_equalities(
+            np.vstack([self.held[1], self.conditions[active]]), np.zeros(len(self.held[0]) + active.sum())
+        )
         matrix = triangle @ free
         normal = matrix.T @ matrix
         return -(free @ np.linalg.lstsq(normal, free.T @ second, rcond=None)[0]) / self.scale
@@ -221,7 +223,7 @@ _UNLIMITED = 500  # cycles of a path without other limits: along a narrow valley
 
 
 @dataclasses.dataclass(frozen=True)
-class State:
+class SumOfSquares:
     """A sum of squares and its conditions at x (n,): residuals (m,), sides, held (h,) = 0 and limits (l,) ≤ 0.
 
     lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, None unless requested.
@@ -250,10 +252,12 @@ class State:
     def is_finite(self) -> bool:
         return bool(np.isfinite(self.cost) and np.isfinite(self.held).all() and np.isfinite(self.limits).all())
 
-    def is_better(self, other: "State") -> bool:
+    def is_better(self, other: "SumOfSquares") -> bool:
         """Fewer failed rays, then conditions met, then a lower merit."""
-        missed = [float(one.missed.max(initial=0.0)) for one in (self, other)]
-        ranks = [(one.lost, m if m > 1e-8 else 0.0, one.cost) for one, m in zip((self, other), missed, strict=True)]
+        missed = [float(state.missed.max(initial=0.0)) for state in (self, other)]
+        ranks = [
+            (state.lost, m if m > 1e-8 else 0.0, state.cost) for state, m in zip((self, other), missed, strict=True)
+        ]
         return ranks[0] < ranks[1]
 
 
@@ -272,7 +276,7 @@ class Cycle:
 
 
 @dataclasses.dataclass(frozen=True)
-class SolverState:
+class CycleStart:
     """All that determines the next cycle.
 
     x: the variables (n,); damping, and factor by which it is raised next; share: of violated conditions that a step
@@ -293,13 +297,13 @@ class SolverState:
 class Descent:
     """The state in which a descent ended, and the reason."""
 
-    state: State
+    state: SumOfSquares
     stopped: str
     cycles: tuple[Cycle, ...]
     evaluations: int
 
 
-Evaluate = Callable[[np.ndarray, bool], State]
+Evaluate = Callable[[np.ndarray, bool], SumOfSquares]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -334,8 +338,8 @@ def least_squares(
     options: SolverOptions = SolverOptions(),
     cycles: int = 1000,
     until: float = np.inf,
-    watch: Callable[[Cycle, SolverState], None] | None = None,
-    resume: SolverState | None = None,
+    watch: Callable[[Cycle, CycleStart], None] | None = None,
+    resume: CycleStart | None = None,
 ) -> Descent:
     """Descend from x, which is within the bounds, for at most so many cycles, or until a time of `time.monotonic`.
 
@@ -361,7 +365,7 @@ class _LeastSquares:
         self.factor = 2.0
         self.seconds = {False: 0.0, True: 0.0}  # of the last evaluation without and with derivatives
 
-    def at(self, x: np.ndarray, derivatives: bool = False) -> State:
+    def at(self, x: np.ndarray, derivatives: bool = False) -> SumOfSquares:
         """The state at x. Raises _OutOfTime."""
         started = time.monotonic()
         if started + self.seconds[derivatives] > self.until:
@@ -371,7 +375,7 @@ class _LeastSquares:
         self.seconds[derivatives] = time.monotonic() - started
         return state
 
-    def descend(self, x: np.ndarray, cycles: int, resume: SolverState | None) -> Descent:
+    def descend(self, x: np.ndarray, cycles: int, resume: CycleStart | None) -> Descent:
         if resume is not None:
             self.damping, self.factor, self.share = resume.damping, resume.factor, resume.share
             self.price, self.scale = resume.price, resume.scale
@@ -463,7 +467,7 @@ class _LeastSquares:
             return step
         return step + bend
 
-    def _restored(self, linear: Linear, trial: State) -> State:
+    def _restored(self, linear: Linear, trial: SumOfSquares) -> SumOfSquares:
         """Nonlinear equalities met again after the step."""
         for _ in range(2):
             if np.abs(trial.held).max() <= _MET * max(np.abs(self.state.held).max(), 1e-3):
@@ -475,7 +479,7 @@ class _LeastSquares:
             trial = again
         return trial
 
-    def _accepts(self, trial: State, predicted: float) -> bool:
+    def _accepts(self, trial: SumOfSquares, predicted: float) -> bool:
         """Whether a trial is accepted; sets the damping by the ratio of achieved to predicted reduction."""
         state = self.state
         if not trial.is_finite or trial.lost > state.lost:
@@ -521,7 +525,7 @@ class _LeastSquares:
         if self.watch is not None:
             self.watch(
                 cycle,
-                SolverState(
+                CycleStart(
                     state.x, self.damping, self.factor, self.share, self.price, self.scale, self.evaluations,
                     tuple(self.cycles),
                 ),
@@ -535,7 +539,7 @@ class _LeastSquares:
 class BestDescent:
     """The best state, the cycles of all paths, and why the path of the best one ended."""
 
-    state: State
+    state: SumOfSquares
     history: tuple[Cycle, ...]
     stopped: str
     cycles: int
@@ -543,13 +547,13 @@ class BestDescent:
 
 
 @dataclasses.dataclass(frozen=True)
-class PathState:
-    """State of several paths: number of the current path, from 0, its start and solver state; cycles and evaluations
-    before it; and the best end (x, reason) of those before it, None for the first."""
+class PathProgress:
+    """Progress of descents along several paths: number of the current path, from 0, its start, and where its next cycle
+    starts; cycles and evaluations of the paths before it, and their best end (x, reason), None for the first path."""
 
     path: int
     start: np.ndarray
-    solver: SolverState | None
+    solver: CycleStart | None
     before: tuple[Cycle, ...] = ()
     evaluations: int = 0
     best: tuple[np.ndarray, str] | None = None
@@ -563,8 +567,8 @@ class PathState:
         """Cycles of this path by their number in all paths."""
         number, evaluations = len(self.before), self.evaluations
         return [
-            dataclasses.replace(one, number=one.number + number, evaluations=one.evaluations + evaluations)
-            for one in cycles
+            dataclasses.replace(cycle, number=cycle.number + number, evaluations=cycle.evaluations + evaluations)
+            for cycle in cycles
         ]
 
 
@@ -578,8 +582,8 @@ def best_of_paths(
     paths: int = 1,
     cycles: int | None = None,
     seconds: float | None = None,
-    watch: Callable[[Cycle, PathState], None] | None = None,
-    resume: PathState | None = None,
+    watch: Callable[[Cycle, PathProgress], None] | None = None,
+    resume: PathProgress | None = None,
 ) -> BestDescent:
     """Descend from x within the bounds with the options of so many PATHS; cycles and seconds: of all of them together,
     without either 500 cycles each.
@@ -588,15 +592,15 @@ def best_of_paths(
     """
     until = time.monotonic() + (np.inf if seconds is None else seconds)
     most = cycles if cycles is not None else _UNLIMITED * max(1, paths) if seconds is None else 1_000_000
-    first = PathState(0, x, None) if resume is None else resume
+    first = PathProgress(0, x, None) if resume is None else resume
     x, best, stopped = first.start, None, ""
     if first.best is not None:
         best, stopped = evaluate(first.best[0], False), first.best[1]
     history, evaluations = first.before, first.evaluations
     for path in range(first.path, min(len(PATHS), max(1, paths))):
-        current = PathState(path, x, first.solver, history, evaluations, None if best is None else (best.x, stopped))
+        current = PathProgress(path, x, first.solver, history, evaluations, None if best is None else (best.x, stopped))
 
-        def each(cycle: Cycle, solver: SolverState, current=current) -> None:
+        def each(cycle: Cycle, solver: CycleStart, current=current) -> None:
             watch(*current.counted([cycle]), dataclasses.replace(current, solver=solver))
 
         descent = least_squares(

@@ -85,15 +85,17 @@ class DesignVariables:
     opening: float = 1.0
 
     def __post_init__(self):
-        for one in (*self.variables, *self.solves):
-            if not 0 <= one.surface < len(self.lens.surfaces):
+        for number in (*self.variables, *self.solves):
+            if not 0 <= number.surface < len(self.lens.surfaces):
                 last = len(self.lens.surfaces) - 1
-                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
-        named = {
-            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
-            for one in self.variables
+                raise UnknownNumber(
+                    f"{number.quantity} of surface {number.surface}: this lens has surfaces 0 to {last}"
+                )
+        moved = {
+            variable.address if variable.operand is None else (variable.operand, variable.configuration, "operand")
+            for variable in self.variables
         }
-        if len(named) < len(self.variables):
+        if len(moved) < len(self.variables):
             raise UnknownNumber("a variable is named twice")
         object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
 
@@ -107,10 +109,10 @@ class DesignVariables:
         """The current variables (n,)."""
         return np.array(
             [
-                stored_or_0(self.lens, (one.surface, one.quantity))
-                if one.operand is None
-                else float(self.lens.operands[one.operand].numbers[one.configuration - 1])
-                for one in self.variables
+                stored_or_0(self.lens, variable.address)
+                if variable.operand is None
+                else float(self.lens.operands[variable.operand].numbers[variable.configuration - 1])
+                for variable in self.variables
             ]
         )
 
@@ -138,13 +140,13 @@ class DesignVariables:
 
 def _with_picked_glasses(lens: Lens, variables: Sequence[Vary], solves: Sequence[Solve]) -> Lens:
     """The lens whose pickups of glasses that vary have the glass that they pick up."""
-    moved, surfaces = {one.surface for one in variables if one.quantity in GLASS}, list(lens.surfaces)
-    pickups = [one for one in solves if (one.quantity, one.kind) == ("glass", "pickup")]
-    for one in sorted(pickups, key=lambda one: one.surface):
-        if one.source in moved:
-            glass = surfaces[one.source].glass
-            surfaces[one.surface] = dataclasses.replace(surfaces[one.surface], glass=glass)
-            moved.add(one.surface)
+    moved, surfaces = {variable.surface for variable in variables if variable.quantity in GLASS}, list(lens.surfaces)
+    pickups = [solve for solve in solves if (solve.quantity, solve.kind) == ("glass", "pickup")]
+    for pickup in sorted(pickups, key=lambda pickup: pickup.surface):
+        if pickup.source in moved:
+            glass = surfaces[pickup.source].glass
+            surfaces[pickup.surface] = dataclasses.replace(surfaces[pickup.surface], glass=glass)
+            moved.add(pickup.surface)
     return dataclasses.replace(lens, surfaces=tuple(surfaces)) if pickups else lens
 
 
@@ -166,32 +168,36 @@ class View:
             lens = dataclasses.replace(lens, surfaces=surfaces)
         #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
         operands = (operand for operand in lens.operands if operand.numbers is not None)
-        overridden = {at for operand in operands for at, _ in addresses_of(lens, operand)}
+        overridden = {address for operand in operands for address, _ in addresses_of(lens, operand)}
         #: By address: the variable that a number follows, its factor and its offset.
         self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
-        for number, one in enumerate(model.variables):
-            if one.operand is None and (one.surface, one.quantity) not in overridden:
-                self.variables[one.surface, one.quantity] = number, 1.0, 0.0
-        own = [one for one in model.solves if one.operand is None and (one.surface, one.quantity) not in overridden]
-        own = [one for one in own if one.quantity == "glass" or not self._is_idle(one, lens)]
-        own = _with_glasses(own, self.variables)
-        self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
-        moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
+        for number, variable in enumerate(model.variables):
+            if variable.operand is None and variable.address not in overridden:
+                self.variables[variable.address] = number, 1.0, 0.0
+        solves = [solve for solve in model.solves if solve.operand is None and solve.address not in overridden]
+        solves = [solve for solve in solves if solve.quantity == "glass" or not self._is_idle(solve, lens)]
+        solves = _with_glasses(solves, self.variables)
+        self.solves = sorted(solves, key=lambda solve: (solve.surface, solve.quantity == "thickness"))
+        moved = (*self.variables, *(solve.address for solve in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
         surfaces = list(lens.surfaces)
         for surface, quantity in self.moved:
             surfaces[surface] = modelled(surfaces[surface], quantity)
         self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
-        self.stored = {at: self.number(at) for at in self.moved}
+        self.stored = {address: self.number(address) for address in self.moved}
         surfaces = self.lens.surfaces
         #: Where the lens holds the numbers that move.
-        self.places = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
+        self.places = {
+            address: path_of(surfaces[address[0]], address[1]) for address in self.moved if address not in OF_LENS
+        }
 
-    def _is_idle(self, one: Solve, lens: Lens) -> bool:
+    def _is_idle(self, solve: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
-        at = [(one.source, one.quantity_of_source or one.quantity), (one.surface, one.quantity)]
-        known = all(quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in at)
-        return one.kind == "pickup" and not known and at[0] not in self.variables
+        addresses = [solve.address_of_source, solve.address]
+        known = all(
+            quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in addresses
+        )
+        return solve.kind == "pickup" and not known and addresses[0] not in self.variables
 
     @cached_property
     def clipping(self) -> "View":
@@ -201,40 +207,38 @@ class View:
     @cached_property
     def waits(self) -> bool:
         """Whether a solve waits for others that come later, or for the entrance pupil that it moves itself."""
-        solved = {(one.surface, one.quantity): position for position, one in enumerate(self.solves)}
+        solved = {solve.address: position for position, solve in enumerate(self.solves)}
 
-        def is_late(position: int, one: Solve) -> bool:
-            if one.kind == "pickup":
-                return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
-            if one.kind in ("power", "position"):
-                return one.source > one.surface
+        def is_late(position: int, solve: Solve) -> bool:
+            if solve.kind == "pickup":
+                return solved.get(solve.address_of_source, -1) >= position
+            if solve.kind in ("power", "position"):
+                return solve.source > solve.surface
             last = sensor(self.lens), "thickness"  # which changes no power
-            if one.kind == "focal_length":
-                return any((later.surface, later.quantity) != last for later in self.solves[position + 1 :])
-            if (one.surface, one.quantity) == last:
+            if solve.kind == "focal_length":
+                return any(later.address != last for later in self.solves[position + 1 :])
+            if solve.address == last:
                 return False
-            if one.kind == "edge_thickness":
-                shape = [
-                    at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
-                ]
-                return bool(shape) or not any(one.numbers[1:])
-            return one.surface < self.lens.stop or self.lens.aperture.kind in (
+            if solve.kind == "edge_thickness":
+                shapes = any(quantity != "thickness" and surface > solve.surface for surface, quantity in solved)
+                return shapes or not any(solve.numbers[1:])
+            return solve.surface < self.lens.stop or self.lens.aperture.kind in (
                 "image_f_number",
                 "paraxial_working_f_number",
             )
 
-        return any(is_late(*found) for found in enumerate(self.solves))
+        return any(map(is_late, range(len(self.solves)), self.solves))
 
     def numbers(self, variables) -> dict[Address, object]:
         """The numbers that variables move, without those that are solved."""
         return {
-            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
-            for at, (number, scale, offset) in self.variables.items()
+            address: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
+            for address, (number, scale, offset) in self.variables.items()
         }
 
-    def number(self, at: Address) -> float:
+    def number(self, address: Address) -> float:
         """A number of the lens as it is stored."""
-        return stored_or_0(self.lens, at)
+        return stored_or_0(self.lens, address)
 
     @cached_property
     def wavelengths(self) -> list[float]:
@@ -254,12 +258,12 @@ class View:
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:
         """What moves of the media, by the surface in front of them: all of them with the air."""
-        air = [at for at in (TEMPERATURE, PRESSURE) if at in self.moved]
-        found: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
+        air = [address for address in (TEMPERATURE, PRESSURE) if address in self.moved]
+        moving: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
         for surface, quantity in self.moved:
             if quantity in GLASS or quantity.startswith(GLASS_NUMBER):
-                found.setdefault(surface, []).append((surface, quantity))
-        return found
+                moving.setdefault(surface, []).append((surface, quantity))
+        return moving
 
     @cached_property
     def thickness(self) -> list[float]:
@@ -303,11 +307,13 @@ class View:
     def is_plain(self) -> bool:
         """Whether all first-order data follow from thicknesses and curvatures alone."""
         plain = "curvature", "thickness", *GLASS
-        others = [at for at in self.stored if at[1] not in plain and not at[1].startswith(GLASS_NUMBER)]
+        others = [
+            address for address in self.stored if address[1] not in plain and not address[1].startswith(GLASS_NUMBER)
+        ]
         units = torch.eye(len(others), dtype=torch.float64)
-        numbers = {at: torch.tensor(float(self.stored[at]), dtype=torch.float64) for at in others}
+        numbers = {address: torch.tensor(float(self.stored[address]), dtype=torch.float64) for address in others}
         with torch.enable_grad():
-            lens = self.held({at: with_tangents(numbers[at], units[k]) for k, at in enumerate(others)})
+            lens = self.held({address: with_tangents(numbers[address], units[k]) for k, address in enumerate(others)})
             powers = [vertex_curvature(s) for s in lens.surfaces if s.curvature is not None or s.is_plane]
             powers += [power_of(s.phase, lens.wavelengths)[1] for s in lens.surfaces if s.phase is not None]
         return not any(bool(tangents_of(power, len(others)).any()) for power in powers)
@@ -336,9 +342,9 @@ class View:
         return LensState(self, variables)
 
 
-def stored_or_0(lens: Lens, at: Address) -> float:
+def stored_or_0(lens: Lens, address: Address) -> float:
     """A number of a lens as it is stored, 0 where it is not modelled."""
-    number = stored_number(lens, at)
+    number = stored_number(lens, address)
     return 0.0 if number is None else float(number)
 
 
@@ -346,9 +352,9 @@ def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tu
     """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
     operands that pick up the number of another configuration."""
     return {
-        at: (number, place.factor * scale, place.factor * offset + place.offset)
+        address: (number, place.factor * scale, place.factor * offset + place.offset)
         for operand, (number, scale, offset) in followed(model, configuration).items()
-        for at, place in addresses_of(model.lens, model.lens.operands[operand])
+        for address, place in addresses_of(model.lens, model.lens.operands[operand])
     }
 
 
@@ -358,36 +364,38 @@ def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int,
     A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
     """
     moved = {
-        (one.operand, one.configuration): (number, 1.0, 0.0)
-        for number, one in enumerate(model.variables)
-        if one.operand is not None
+        (variable.operand, variable.configuration): (number, 1.0, 0.0)
+        for number, variable in enumerate(model.variables)
+        if variable.operand is not None
     }
-    pickups = [one for one in model.solves if one.operand is not None and one.kind == "pickup" and one.numbers]
+    pickups = [
+        solve for solve in model.solves if solve.operand is not None and solve.kind == "pickup" and solve.numbers
+    ]
     for _ in pickups:
-        for one in pickups:
-            source, at = (int(one.numbers[0]), one.source), (one.operand, one.configuration)
-            if source in moved and at not in moved:
+        for pickup in pickups:
+            source, place = (int(pickup.numbers[0]), pickup.source), (pickup.operand, pickup.configuration)
+            if source in moved and place not in moved:
                 number, scale, offset = moved[source]
                 added = (
-                    one.offset * model.lens.optimization_data.unit ** _POWERS.get(one.quantity, 0)
+                    pickup.offset * model.lens.optimization_data.unit ** _POWERS.get(pickup.quantity, 0)
                     if model.lens.optimization_data
                     else 0.0
                 )
-                moved[at] = number, one.scale * scale, one.scale * offset + added
-    return {operand: linear for (operand, at), linear in moved.items() if at == configuration}
+                moved[place] = number, pickup.scale * scale, pickup.scale * offset + added
+    return {operand: linear for (operand, place), linear in moved.items() if place == configuration}
 
 
 def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
     """Pickups of glasses as pickups of each number that varies of the glass that is picked up."""
-    moved, found = set(variables), []
-    for one in sorted(solves, key=lambda one: one.surface):
-        if one.quantity != "glass":
-            found.append(one)
+    moved, expanded = set(variables), []
+    for solve in sorted(solves, key=lambda solve: solve.surface):
+        if solve.quantity != "glass":
+            expanded.append(solve)
             continue
-        names = [name for name in GLASS if (one.source, name) in moved]
-        moved |= {(one.surface, name) for name in names}
-        found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
-    return found
+        names = [name for name in GLASS if (solve.source, name) in moved]
+        moved |= {(solve.surface, name) for name in names}
+        expanded += [Solve(solve.surface, name, "pickup", source=solve.source) for name in names]
+    return expanded
 
 
 def addresses_of(lens: Lens, operand: Operand) -> Iterator[tuple[Address, ScaledPath]]:
@@ -411,7 +419,7 @@ def _marginal_ray_before(state, surface: int):
 
 
 def _pickup(state, solve: Solve):
-    return solve.scale * state.number(solve.source, solve.quantity_of_source or solve.quantity) + solve.offset
+    return solve.scale * state.number(*solve.address_of_source) + solve.offset
 
 
 def _curvature_for(state, solve: Solve, omega_behind):
@@ -447,8 +455,8 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     (_, y, z), (_, M, N) = rays.position, rays.direction
     crosses = rays.valid & (M != 0)
     ratio = N / torch.where(crosses, M, torch.ones_like(M))
-    at = z.new_tensor(height)
-    thickness = z + ratio * (at - y) - sag_at(lens.surfaces[k + 1], torch.zeros_like(at), at)
+    y_next = z.new_tensor(height)
+    thickness = z + ratio * (y_next - y) - sag_at(lens.surfaces[k + 1], torch.zeros_like(y_next), y_next)
     return torch.where(crosses, thickness, torch.nan)
 
 
@@ -457,8 +465,8 @@ def _edge_thickness(state, solve: Solve):
     k, (edge, height) = solve.surface, solve.numbers
 
     def thickness(lens: Lens) -> list[Tensor]:
-        at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
-        near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
+        y = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
+        near, far = (sag_at(surface, torch.zeros_like(y), y) for surface in lens.surfaces[k : k + 2])
         return [edge - edge_thickness(0.0, near, far)]
 
     return state.through_torch(thickness)[0]
@@ -482,7 +490,7 @@ def _focal_length(state, solve: Solve):
     thickness v. It is finite where the lens is afocal."""
     powers = []
     for number in (0.0, 1.0):
-        state.numbers[solve.surface, solve.quantity] = number
+        state.numbers[solve.address] = number
         state.forget()
         powers.append(-state.gaussian(state.primary).C)
     wanted = abs(state.index(state.primary)[-2]) / solve.numbers[0]
@@ -592,7 +600,7 @@ class LensState:
         glasses = self.view.glasses
         if not glasses:
             return {}
-        moved = [at for addresses in glasses.values() for at in addresses]
+        moved = [address for addresses in glasses.values() for address in addresses]
         axes = max((number.dim() for number in self.variables), default=0) if self.is_of_tensors else 0
         waves = self.lens.wavelengths.reshape(-1, *[1] * axes)
         indices = self.in_one_pass(lambda lens: [index_behind(lens, k, waves) for k in glasses], only=moved)
@@ -695,7 +703,7 @@ class LensState:
 
     def _solve(self) -> None:
         """Solves and pickups in the order of surfaces, repeated until they converge where one depends on later ones."""
-        stored = [self.view.stored[one.surface, one.quantity] for one in self.view.solves]
+        stored = [self.view.stored[solve.address] for solve in self.view.solves]
         if not self.view.waits:
             self._passed(stored)
         elif self.is_of_tensors:
@@ -707,9 +715,9 @@ class LensState:
         """What a pass through all solves makes of their numbers."""
         passed = []
         self._take(solved)
-        for one in self.view.solves:
-            passed.append(SOLVES[one.kind](self, one))
-            self.numbers[one.surface, one.quantity] = passed[-1]
+        for solve in self.view.solves:
+            passed.append(SOLVES[solve.kind](self, solve))
+            self.numbers[solve.address] = passed[-1]
             self.forget()
         return passed
 
@@ -727,14 +735,14 @@ class LensState:
         Passes without derivatives come to s. From there a step of Newton's method has the first derivatives of s by x,
         ds/dx = (1 - ∂P/∂s)⁻¹ ∂P/∂x, and a second step the second ones.
         """
-        ats = [(one.surface, one.quantity) for one in self.view.solves]
+        ats = [solve.address for solve in self.view.solves]
 
         def passed(state: LensState, solved: Tensor) -> Tensor:
             state._passed(solved.unbind())
             return torch.stack([number.expand(solved.shape[1:]) for number in state.tensors(ats).values()])
 
         still = copy.copy(self)
-        still._kept, still.numbers = {}, {at: number.detach() for at, number in self.numbers.items()}
+        still._kept, still.numbers = {}, {address: number.detach() for address, number in self.numbers.items()}
         with torch.no_grad():
             still._settled(stored)
         solved = torch.stack(torch.broadcast_tensors(*still.tensors(ats).values()))
@@ -751,7 +759,7 @@ class LensState:
 
     def _take(self, solved: Sequence) -> None:
         """Other numbers of the solves."""
-        self.numbers |= {(one.surface, one.quantity): n for one, n in zip(self.view.solves, solved, strict=True)}
+        self.numbers |= {solve.address: n for solve, n in zip(self.view.solves, solved, strict=True)}
         self.forget()
 
     def forget(self) -> None:
@@ -770,7 +778,7 @@ class LensState:
         if self.is_of_tensors:
             return [*function(self.moving_lens())]
         with torch.set_grad_enabled(self.count > 0):
-            leaves = {at: _tensor(number).requires_grad_() for at, number in self.numbers.items()}
+            leaves = {address: _tensor(number).requires_grad_() for address, number in self.numbers.items()}
             numbers = [n.reshape(()) for n in function((self.view.clipping if clips else self.view).held(leaves))]
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
@@ -779,8 +787,8 @@ class LensState:
         value, slope = float(number.detach()), np.zeros(self.count)
         if number.requires_grad:
             by = torch.autograd.grad(number, list(leaves.values()), retain_graph=True, allow_unused=True)
-            for at, derivative in zip(leaves, by, strict=True):
-                moved = self.numbers[at]
+            for address, derivative in zip(leaves, by, strict=True):
+                moved = self.numbers[address]
                 if derivative is not None and isinstance(moved, Dual):
                     slope = slope + float(derivative) * moved.slope
         return Dual(value, slope)
@@ -802,13 +810,15 @@ class LensState:
 
     def tensors(self, only: Sequence | None = None) -> dict:
         """The numbers, or some, as tensors, by address; dual ones carry their derivatives by all variables."""
-        numbers = {at: self.numbers[at] for at in only or self.numbers}
+        numbers = {address: self.numbers[address] for address in only or self.numbers}
         if self.is_of_tensors:
             like = self.lens.wavelengths
-            return {at: n if isinstance(n, Tensor) else like.new_tensor(n) for at, n in numbers.items()}
+            return {address: n if isinstance(n, Tensor) else like.new_tensor(n) for address, n in numbers.items()}
         if not self.count:
-            return {at: _tensor(number) for at, number in numbers.items()}
-        return {at: with_tangents(_tensor(n), torch.tensor(slope_of(n, self.count))) for at, n in numbers.items()}
+            return {address: _tensor(number) for address, number in numbers.items()}
+        return {
+            address: with_tangents(_tensor(n), torch.tensor(slope_of(n, self.count))) for address, n in numbers.items()
+        }
 
     def moving_lens(self, only: Sequence | None = None) -> Lens:
         """The lens without apertures, whose numbers carry their derivatives by all variables."""
@@ -848,9 +858,9 @@ def _powers(state: LensState, wavelength: int) -> list:
     """Powers in 1/mm of the surfaces from 1 to that before the image, of any kind of number that varies."""
 
     def powers(lens: Lens) -> list[Tensor]:
-        at, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
-        n = signed(surfaces, media(lens, at)[:-1])
-        return [power(*part, at) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
+        wavelength_um, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
+        n = signed(surfaces, media(lens, wavelength_um)[:-1])
+        return [power(*part, wavelength_um) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
 
     return state.in_one_pass(powers)
 
@@ -869,9 +879,9 @@ def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
     """Where variables other than curvatures, thicknesses and glasses change the power of a surface."""
 
     def matrices(lens: Lens) -> list[Tensor]:
-        at = lens.wavelengths[wavelength]
-        found = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, at)[:-1]), at)
-        return [found.A, found.B, found.C, found.D, *found.front, *found.rear]
+        wavelength_um = lens.wavelengths[wavelength]
+        matrix = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, wavelength_um)[:-1]), wavelength_um)
+        return [matrix.A, matrix.B, matrix.C, matrix.D, *matrix.front, *matrix.rear]
 
     A, B, C, D, A1, B1, B2, D2 = state.through_torch(matrices)
     n = state.index(wavelength)
@@ -930,7 +940,7 @@ def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: n
     (x, y), _ = at_stop(state, tuple(points))
     slopes = [slope_of(part, state.count) for part in (target[0] * radius - x, target[1] * radius - y)]
     moved = [inverse[k][0] * slopes[0] + inverse[k][1] * slopes[1] for k in range(2)]
-    dual = tuple(Dual(at, np.where(converged, by, 0.0)) for at, by in zip(points, moved, strict=True))
+    dual = tuple(Dual(point, np.where(converged, by, 0.0)) for point, by in zip(points, moved, strict=True))
     return dual, converged, points
 
 
@@ -1163,19 +1173,19 @@ class Bundle:
         """All rays on all surfaces from 1 to `last`, in the order of `ask`."""
         if self.is_expressible:
             surfaces, task, changes, start, count = self._task(state, *self.launched(state))
-            found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
-            if found is not None:
+            pushed = pushed_everywhere(surfaces, task, changes[: count or 0], start)
+            if pushed is not None:
                 places, size, rows = self._places[0], self.field[0].size, rows_of(task.structure, surfaces)
 
                 def picked(part: Tensor) -> np.ndarray:
                     return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
 
-                by = () if count is None else map(picked, found.by_position[:2])
-                return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
+                by = () if count is None else map(picked, pushed.by_position[:2])
+                return Marks(*map(picked, pushed.position[:2]), picked(pushed.valid), *by)
         hits = [bundle.hits(state) for bundle in self._each]
         parts = [[hit.position[k] for hit in hits] for k in range(2)]
-        values = (np.stack([value_of(one) for one in part]) for part in parts)
-        slopes = (np.stack([slope_of(one, state.count) for one in part]) for part in parts if state.count)
+        values = (np.stack([value_of(number) for number in part]) for part in parts)
+        slopes = (np.stack([slope_of(number, state.count) for number in part]) for part in parts if state.count)
         return Marks(*values, np.stack([hit.valid for hit in hits]), *slopes)
 
     @cached_property
@@ -1229,12 +1239,12 @@ class Bundle:
             return self._table_by_torch(state)
         table = stored.copy()
         changes = np.zeros((state.count, *table.shape))
-        for at, number in state.numbers.items():
-            if at not in columns:
+        for address, number in state.numbers.items():
+            if address not in columns:
                 continue
-            table[:, columns[at]] = value_of(number)
+            table[:, columns[address]] = value_of(number)
             if isinstance(number, Dual):
-                changes[:, :, columns[at]] = number.slope[:, None, None]
+                changes[:, :, columns[address]] = number.slope[:, None, None]
         for surface, index in state.media.items():
             if surface in columns:
                 table[:, columns[surface]] = value_of(index)[:, None]
@@ -1254,9 +1264,9 @@ class Bundle:
             return parts[:3], parts[3:6], parts[6], valid
         if not self._aims:
             return self._through(state, self.pupil)
-        pupil, found = self._aimed(state)
+        pupil, aimed = self._aimed(state)
         *rays, valid = self._through(state, pupil)
-        return *rays, valid & found
+        return *rays, valid & aimed
 
     def _through(self, state: LensState, pupil):
         shape = self.field.shape[1:]

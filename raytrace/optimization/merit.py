@@ -416,11 +416,11 @@ def arguments(row: Row) -> str:
     """The arguments of a row as text: its integers with their meaning, if known, and its four numbers."""
     operand = OPERANDS.get(row.operand)
     takes = operand.takes if operand is not None else ("", "")
-    named = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
-    plain = [] if named or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
+    integers = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
+    plain = [] if integers or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
     numbers = [f"{number:.6g}" for number in row.numbers]
     has_numbers = any(row.numbers) and not (row.operand in BOUNDARIES and row.numbers == AT_RIM)
-    return "  ".join([*named, *plain, *([" ".join(numbers)] if has_numbers else [])])
+    return "  ".join([*integers, *plain, *([" ".join(numbers)] if has_numbers else [])])
 
 
 def configurations_of(rows: Iterable[Row], current: int) -> list[int]:

@@ -29,9 +29,9 @@ class MeritOfBatch:
     def __init__(self, lens: Lens, function: Merit):
         self.count, lens = lens.count or 1, aligned(lens, 0, exactly=True)
         first = pytree.tree_map_only(Tensor, Tensor.detach, lens if lens.count is None else lens[0])
-        found = dict(_differing(lens, first))
-        self.addresses = tuple(found)
-        columns = [number.reshape(-1).expand(self.count) for number in found.values()]
+        differing = dict(_differing(lens, first))
+        self.addresses = tuple(differing)
+        columns = [number.reshape(-1).expand(self.count) for number in differing.values()]
         self.by = tuple(k for k, column in enumerate(columns) if column.requires_grad)
         self.numbers = torch.stack(columns, -1) if columns else lens.wavelengths.new_zeros(self.count, 0)
         model = DesignVariables(first, variables=tuple(Vary(*address) for address in self.addresses))
@@ -55,9 +55,11 @@ class _Square(torch.autograd.Function):
         each = [evaluation(row, derivatives=needed, shown=False, by=by) for row in x.numpy()]
         if needed:
             slopes = torch.zeros_like(x)
-            slopes[:, list(by)] = x.new_tensor(np.stack([2 * one.residuals @ one.jacobian for one in each]))
+            slopes[:, list(by)] = x.new_tensor(
+                np.stack([2 * evaluated.residuals @ evaluated.jacobian for evaluated in each])
+            )
             context.save_for_backward(slopes)
-        return x.new_tensor([one.residuals @ one.residuals for one in each])
+        return x.new_tensor([evaluated.residuals @ evaluated.residuals for evaluated in each])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -68,9 +70,9 @@ class _Square(torch.autograd.Function):
 def _differing(lens: Lens, first: Lens) -> Iterator[tuple[Address, Tensor]]:
     """The numbers, () or (L, 1, …), that differ between the lenses or require a gradient, by their address."""
     if lens.environment is not None and lens.count is not None:
-        own = first.environment
+        environment = first.environment
         for name in ("temperature", "pressure"):
-            if getattr(lens.environment, name).dim() > getattr(own, name).dim():
+            if getattr(lens.environment, name).dim() > getattr(environment, name).dim():
                 raise ValueError(f"merit functions take no batch of {name}s: evaluate each lens by itself")
     if _moves(lens.aperture.value, first.aperture.value):
         yield APERTURE, lens.aperture.value
@@ -79,11 +81,11 @@ def _differing(lens: Lens, first: Lens) -> Iterator[tuple[Address, Tensor]]:
         for n in range(single.glass.coefficients.numel()):
             paths[f"{GLASS_NUMBER}{n + 1}"] = ParameterPath(("glass", "coefficients"), n)
         for quantity, (steps, entry) in paths.items():
-            part, one = surface, single
+            part, of_first = surface, single
             for name in steps:
-                part, one = getattr(part, name), getattr(one, name)
-            if part is not None and _moves(part, one):
-                yield (k, quantity), part if entry is None else part.reshape(one.numel(), -1)[entry]
+                part, of_first = getattr(part, name), getattr(of_first, name)
+            if part is not None and _moves(part, of_first):
+                yield (k, quantity), part if entry is None else part.reshape(of_first.numel(), -1)[entry]
 
 
 def _moves(number: Tensor, single: Tensor) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.optimization.least_squares import Cycle, SolverOptions, SolverState, least_squares
+from raytrace.optimization.least_squares import Cycle, CycleStart, SolverOptions, least_squares
 from raytrace.optimization.problem import Problem, typical_of
 
 #: Parts of the pupil and of the field, in the order in which they are opened.
@@ -61,7 +61,7 @@ def opened(
     }
     stages = [*(problem.through(part) for part in PARTS[:-1]), problem]
 
-    def each(cycle: Cycle, solver: SolverState) -> None:
+    def each(cycle: Cycle, solver: CycleStart) -> None:
         nonlocal shown
         whole = problem.state(solver.x, False)
         shown = whole if whole.is_finite and whole.is_better(shown) else shown

@@ -17,7 +17,7 @@ from raytrace.optimization.attained import NotReached, attained
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
-from raytrace.optimization.least_squares import BestDescent, Cycle, PathState, best_of_paths, minimise
+from raytrace.optimization.least_squares import BestDescent, Cycle, PathProgress, best_of_paths, minimise
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, merit_for
 from raytrace.optimization.opening import Opened, opened
 from raytrace.optimization.optimized import AsBuiltChange, Optimized
@@ -109,11 +109,13 @@ def optimize(
         variables |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
         return {**identity(lens), **variables, **of_merit}
 
-    def stored(of: Mapping[str, object]) -> Stored:
-        return Stored(model.start, {}) if resume is None else read_checkpoint(resume, of, names)
+    def stored(about: Mapping[str, object]) -> Stored:
+        return Stored(model.start, {}) if resume is None else read_checkpoint(resume, about, names)
 
-    def observer(of: Mapping[str, object], watch: Callable | None, descent: PathState | None = None) -> "_Observer":
-        file = None if checkpoint is None else Checkpoint(checkpoint, of, names)
+    def observer(
+        about: Mapping[str, object], watch: Callable | None, descent: PathProgress | None = None
+    ) -> "_Observer":
+        file = None if checkpoint is None else Checkpoint(checkpoint, about, names)
         return _Observer(log, file, progress and progress(cycles, "cycle"), descent, watch)
 
     if callable(merit):
@@ -123,10 +125,10 @@ def optimize(
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
         if as_built is not None:
             raise NoProblem("`as_built` goes with a merit of rows: add `as_built.of(lens).expected` to the function")
-        of = about(merit=getattr(merit, "__qualname__", type(merit).__name__)) if is_stored else {}
-        function = FunctionMerit(model, merit, stored(of).evaluated)
+        dependencies = about(merit=getattr(merit, "__qualname__", type(merit).__name__)) if is_stored else {}
+        function = FunctionMerit(model, merit, stored(dependencies).evaluated)
         start = np.clip(model.start, lower, upper)
-        with observer(of, watch and (lambda cycle, x: watch(cycle, _lens_at(model, x)))) as seen:
+        with observer(dependencies, watch and (lambda cycle, x: watch(cycle, _lens_at(model, x)))) as seen:
             before = function(model.start)[0]
             if not np.isfinite(before):
                 raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
@@ -145,11 +147,11 @@ def optimize(
     conditions, of_rows = conditions_in_unit(lens, hold, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, rows.rows, conditions, as_built=term, **of_rows)
-    of = {}
+    dependencies = {}
     if is_stored:
-        of = about(merit=digest([repr(row) for row in rows.rows], of_rows), hold=digest(repr(conditions)))
-        of |= {} if term is None else {"as built": digest(term.about())}
-    resumed = stored(of)
+        dependencies = about(merit=digest([repr(row) for row in rows.rows], of_rows), hold=digest(repr(conditions)))
+        dependencies |= {} if term is None else {"as built": digest(term.about())}
+    resumed = stored(dependencies)
     if set(resumed.glasses) - set(glasses):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
     start, choice, opening = np.clip(resumed.x, lower, upper), None, Opened(resumed.x)
@@ -174,7 +176,7 @@ def optimize(
         _refuse_undefined(problem, problem.evaluated(start, True))
         seconds_of_end = min(seconds_of_end, time.monotonic() - evaluating)  # the first evaluation takes longer
     until -= seconds_of_end  # the result is evaluated once more
-    with observer(of, watch_lens, resumed.descent) as seen:
+    with observer(dependencies, watch_lens, resumed.descent) as seen:
         if glasses and not opening.interrupted:
             pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
             keep = seen.checkpoint and seen.checkpoint.write_glasses
@@ -218,7 +220,7 @@ class _Observer:
         log: str | PathLike | None,
         checkpoint: Checkpoint | None,
         bar: Any,
-        descent: PathState | None,
+        descent: PathProgress | None,
         watch: Callable[[Cycle, np.ndarray], object] | None,
     ):
         cycles = () if descent is None else descent.history
@@ -227,7 +229,7 @@ class _Observer:
         if bar is not None and cycles:
             bar.update(len(cycles))
 
-    def after_cycle_of_paths(self, cycle: Cycle, descent: PathState) -> None:
+    def after_cycle_of_paths(self, cycle: Cycle, descent: PathProgress) -> None:
         self.descent = descent
         self.after_cycle(cycle, descent.solver.x, descent=descent)
 
@@ -290,7 +292,7 @@ def _lens_at(
     variables = tuple(
         dataclasses.replace(variable, bounds=bounds.get(name_of(variable), variable.bounds))
         for variable in data.variables
-        if (variable.surface, variable.quantity) not in OF_LENS  # which no file holds
+        if variable.address not in OF_LENS  # which no file holds
     )
     return dataclasses.replace(lens, optimization_data=dataclasses.replace(data, variables=variables))
 

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from raytrace.analysis.chief import SAMPLES
 from raytrace.maths.numerics import Dual, slope_of, value_of
-from raytrace.optimization.least_squares import Sides, State
+from raytrace.optimization.least_squares import Sides, SumOfSquares
 from raytrace.optimization.lens_state import Bundle, LensState, Ray
 from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit
 from raytrace.optimization.operands.aberrations import unvignetted
@@ -86,9 +86,9 @@ def conditions_of(lens: Lens, hold: str | Sequence[str] | None) -> tuple[Conditi
 
 def conditions_in_unit(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
     """The conditions of `hold`, from mm to the unit of length of the merit function."""
-    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
+    in_words = hold is None or isinstance(hold, str) or all(isinstance(condition, str) for condition in hold)
     conditions = conditions_of(lens, hold) if in_words else hold
-    return tuple(dataclasses.replace(one, row=in_unit(one.row, 1.0, unit)) for one in conditions)
+    return tuple(dataclasses.replace(condition, row=in_unit(condition.row, 1.0, unit)) for condition in conditions)
 
 
 def _condition(lens: Lens, word: str) -> Condition:
@@ -273,8 +273,8 @@ class Recovery:
         if surface == 1:
             bundle, numbers = self._bundle(view, 1, rays)
             position, direction, *_ = bundle.launched(state)
-            at = int(bundle._places[0][numbers[number]])
-            flat = [part.reshape(-1)[at] for part in (*position, *direction)]
+            place = int(bundle._places[0][numbers[number]])
+            flat = [part.reshape(-1)[place] for part in (*position, *direction)]
             return flat[:3], flat[3:]
         bundle, numbers = self._bundle(view, surface - 1, rays)
         if surface not in traced:
@@ -386,7 +386,7 @@ class Problem:
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)
 
-    def state(self, x: np.ndarray, derivatives: bool) -> State:
+    def state(self, x: np.ndarray, derivatives: bool) -> SumOfSquares:
         """Residuals of rows of positive weight and of the lens as built, and violations of the other rows, in units of
         their rows."""
         evaluated = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
@@ -395,14 +395,14 @@ class Problem:
         sides, count = evaluated.sides, len(x)
         rows, excess, slopes = np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, count))
         if sides:  # one-sided rows of all operands
-            rows, excess = (np.concatenate([one[k] for one in sides]) for k in range(2))
-            slopes = np.concatenate([np.zeros((len(one[1]), count)) if one[2] is None else one[2] for one in sides])
+            rows, excess = (np.concatenate([side[k] for side in sides]) for k in range(2))
+            slopes = np.concatenate([np.zeros((len(side[1]), count)) if side[2] is None else side[2] for side in sides])
         sided = np.isin(of_row, rows)
         squared, exact = (weights[of_row] > 0) & ~sided, (weights[of_row] < 0) & ~sided
         equal, limit = exact & (signs == 0), exact & (signs != 0)
         soft, hard = weights[rows] > 0, weights[rows] < 0
         of_hard = self.evaluation.factors[rows[hard]]
-        state = State(
+        state = SumOfSquares(
             x,
             residuals[squared],
             int(evaluated.lost[weights != 0].sum()),
@@ -479,7 +479,7 @@ class FunctionMerit:
         self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()
     ):
         self.model, self.function, self.evaluations, self.evaluated = model, function, 0, [*evaluated]
-        self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
+        self.known = {evaluation[: len(evaluation) // 2].tobytes(): evaluation for evaluation in self.evaluated}
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """The merit and its gradient (n,)."""
@@ -509,11 +509,11 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
     where the merit function or a condition does."""
     if any(row.operand == "PRIM" for row in rows):
         yield Row("PRIM", (0, lens.primary_wavelength)), 0
-    several = any(row.operand == "CONF" for row in rows) or any(one.configuration for one in conditions)
-    for one in conditions:
+    several = any(row.operand == "CONF" for row in rows) or any(condition.configuration for condition in conditions)
+    for condition in conditions:
         if several:
-            yield Row("CONF", (one.configuration or lens.current_configuration, 0)), 0
-        yield dataclasses.replace(one.row, weight=-1.0), RELATIONS[one.relation]
+            yield Row("CONF", (condition.configuration or lens.current_configuration, 0)), 0
+        yield dataclasses.replace(condition.row, weight=-1.0), RELATIONS[condition.relation]
 
 
 def typical_of(model: DesignVariables) -> np.ndarray:
@@ -521,7 +521,7 @@ def typical_of(model: DesignVariables) -> np.ndarray:
     state = model.views[model.lens.current_configuration - 1].state(model.start)
     h = 0.5 * float(state.entrance_pupil_diameter)
     typical = {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}
-    names = [one.quantity for one in model.variables]
+    names = [variable.quantity for variable in model.variables]
     return np.array(
         [
             0.01 * h ** (1 - int(name[1:])) if name[0] == "a" and name[1:].isdigit() else typical.get(name, np.inf)

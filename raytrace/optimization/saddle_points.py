@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from raytrace.materials.glass import is_air
-from raytrace.optimization.least_squares import SolverOptions, State
+from raytrace.optimization.least_squares import SolverOptions, SumOfSquares
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem
@@ -53,20 +53,20 @@ _ACTIVE = 1e-9  # up to which a limit counts as reached
 # -- surfaces for a meniscus -------------------------------------------------------------------------------------------
 
 
-def surfaces_of(free: DesignVariables, named: Sequence[int] = ()) -> tuple[int, ...]:
+def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[int, ...]:
     """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
         raise NoProblem("`insert`: the lens has several configurations; take one of them")
-    if not named:
-        found = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
-        if not found:
+    if not surfaces:
+        surfaces = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
+        if not surfaces:
             raise NoProblem("`insert`: no spherical surface between glass and air whose curvature varies")
-        return found
-    for k in named:
+        return surfaces
+    for k in surfaces:
         if objection := _objection(free, k):
             raise NoProblem(f"`insert`: surface {k} {objection}")
-    return tuple(dict.fromkeys(named))
+    return tuple(dict.fromkeys(surfaces))
 
 
 def _objection(free: DesignVariables, k: int) -> str:
@@ -80,7 +80,7 @@ def _objection(free: DesignVariables, k: int) -> str:
         return "is not a centred refracting sphere"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
         return "is not between glass and air"
-    varies = any((one.surface, one.quantity) == (k, "curvature") for one in free.variables)
+    varies = any(variable.address == (k, "curvature") for variable in free.variables)
     return "" if varies else "has a curvature that does not vary: name it by `vary`"
 
 
@@ -91,15 +91,15 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
     made, free = with_meniscus(lens, k), task.model
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
-    old = [_moved(one, k) for one in free.variables]
-    own = {one: ends for one, *ends in zip(old, *task.bounds, strict=True)}
-    steep = own[next(one for one in old if (one.surface, one.quantity) == (k + 2, "curvature"))]
-    own |= {one: steep if one.quantity == "curvature" else (-np.inf, np.inf) for one in new}
-    quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
-    variables = tuple(sorted(own, key=lambda one: (quantities.index(one.quantity), one.surface)))
-    solves = tuple(_moved(one, k) for one in free.solves)
+    old = [_moved(variable, k) for variable in free.variables]
+    bounds = {variable: ends for variable, *ends in zip(old, *task.bounds, strict=True)}
+    steep = bounds[next(variable for variable in old if variable.address == (k + 2, "curvature"))]
+    bounds |= {variable: steep if variable.quantity == "curvature" else (-np.inf, np.inf) for variable in new}
+    quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *old)))
+    variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
+    solves = tuple(_moved(solve, k) for solve in free.solves)
     if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
-        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(one, k) for one in data.kept)
+        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(solve, k) for solve in data.kept)
         diameters = tuple(_behind(surface, k) for surface in data.semi_diameters)
         data = replace(data, variables=variables, solves=solves, merit=merit, semi_diameters=diameters, kept=kept)
         made = replace(made, optimization_data=replace(data, tolerances=()))
@@ -107,8 +107,8 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
         task,
         model=DesignVariables(made, variables, solves),
         rows=tuple(_row(row, k) for row in task.rows),
-        conditions=tuple(replace(one, row=_row(one.row, k)) for one in task.conditions),
-        bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
+        conditions=tuple(replace(condition, row=_row(condition.row, k)) for condition in task.conditions),
+        bounds=tuple(np.array([bounds[variable][side] for variable in variables], dtype=float) for side in range(2)),
     )
 
 
@@ -116,7 +116,7 @@ def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
     """The rows with that part of the least thicknesses task of the new gaps, of 0 none; as many rows ahead of those
     that are split off."""
     pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
-    return (*(one[0] for one in pieces), *(row for one in pieces for row in one[1:]))
+    return (*(piece[0] for piece in pieces), *(row for piece in pieces for row in piece[1:]))
 
 
 def with_meniscus(lens: Lens, k: int) -> Lens:
@@ -134,9 +134,9 @@ def _behind(surface: int, k: int) -> int:
     return surface + 2 if surface >= k else surface
 
 
-def _moved(one: Vary | Solve, k: int) -> Vary | Solve:
-    further = {"source": _behind(one.source, k)} if isinstance(one, Solve) else {}
-    return replace(one, surface=_behind(one.surface, k), **further)
+def _moved(moved: Vary | Solve, k: int) -> Vary | Solve:
+    further = {"source": _behind(moved.source, k)} if isinstance(moved, Solve) else {}
+    return replace(moved, surface=_behind(moved.surface, k), **further)
 
 
 def _row(row: Row, k: int) -> Row:
@@ -156,10 +156,10 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
     if not is_least or last < k or first > k + 1:
         return [row]
     ranges = [(first, k - 1), (max(first, k + 2), last)]
-    found = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
+    rows = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
     if part > 0:
-        found.append(replace(row, integers=(k, k + 1), target=part * row.target))
-    return found or [replace(row, weight=0.0)]
+        rows.append(replace(row, integers=(k, k + 1), target=part * row.target))
+    return rows or [replace(row, weight=0.0)]
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------
@@ -200,7 +200,7 @@ def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
     return Saddle(ways, ways.T @ gradient(state), 0.5 * along.T @ (second + second.T) @ along)
 
 
-def _slope(state: State) -> np.ndarray:
+def _slope(state: SumOfSquares) -> np.ndarray:
     """Half the gradient (n,) of the sum of squares."""
     sides = state.sides
     over = sides.excess > 0
@@ -208,7 +208,7 @@ def _slope(state: State) -> np.ndarray:
     return state.jacobian.T @ state.residuals + sums[sides.row[over]] @ sides.slope[over]
 
 
-def _conditions(state: State, like: State | None = None) -> np.ndarray:
+def _conditions(state: SumOfSquares, like: SumOfSquares | None = None) -> np.ndarray:
     """Slopes (h, n) of what is held and of the limits that are reached, at the state `like`."""
     reached = (like or state).limits > -_ACTIVE
     return np.concatenate([state.held_slope, state.limits_slope[reached]])
@@ -232,7 +232,9 @@ class Place:
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
         """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
         space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
-        gaps = np.array([one.quantity == "thickness" and one.surface in new for one in self.task.model.variables])
+        gaps = np.array(
+            [variable.quantity == "thickness" and variable.surface in new for variable in self.task.model.variables]
+        )
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
         problem = self.task.problem(thinned(self.task.rows, self.k, part))
@@ -242,8 +244,8 @@ class Place:
     def family(self) -> tuple:
         """What lenses have in common whose variables can be compared."""
         lens = self.task.model.lens
-        variables = tuple((one.surface, one.quantity) for one in self.task.model.variables)
-        media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
+        variables = tuple(variable.address for variable in self.task.model.variables)
+        media = tuple((surface.glass.name, *surface.glass.coefficients.tolist()) for surface in lens.surfaces)
         return media, lens.stop, variables
 
     def gone(self, sign: float, until: float = np.inf) -> TaskResult:
@@ -262,11 +264,11 @@ class Place:
         unit = np.sqrt(problem.state(x, False).cost) / np.linalg.norm(columns * way)
         best, least = x + _OFF[0] * unit * way, np.inf
         for size in _OFF:
-            there = self._met(stage, x + size * unit * way)
-            state = problem.state(there, False)
+            trial = self._met(stage, x + size * unit * way)
+            state = problem.state(trial, False)
             if not state.is_finite or state.lost or state.cost >= least:
                 break
-            best, least = there, state.cost
+            best, least = trial, state.cost
         return best
 
     def _met(self, stage: Stage, x: np.ndarray) -> np.ndarray:
@@ -293,7 +295,7 @@ class Insertion:
     task: SearchProblem
     journal: Journal
     places: Sequence[int]
-    found: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
+    families: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
     started: int = 0  # descents
 
     DONE: ClassVar[str] = "surfaces"
@@ -308,10 +310,10 @@ class Insertion:
         model, space = self.task.model, self.task.space
         stage = Stage(self.task.whole, LONG, FOLLOW, space.lower, space.upper)
         until = self.journal.until
-        own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
-        if not own.is_valid:
+        of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
+        if not of_lens.is_valid:
             raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
-        lens, work = model.lens_at(own.x), own.seconds
+        lens, work = model.lens_at(of_lens.x), of_lens.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:
             for k in self.places:
@@ -329,7 +331,7 @@ class Insertion:
         space = place.task.space
         ends = self.journal.each(tasks, len(space.lower))
         ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.found.setdefault(place.family, (place.task.whole, Minima(ranges)))
+        _, minima = self.families.setdefault(place.family, (place.task.whole, Minima(ranges)))
         for (key, _), end in zip(tasks, ends, strict=True):
             work += end.seconds
             minima.add(end, key, work)
@@ -342,5 +344,5 @@ class Insertion:
 
     def each(self) -> list[tuple[Problem, Minimum]]:
         """All minima, the best first, each with the problem that it is one of."""
-        found = [(problem, one) for problem, minima in self.found.values() for one in minima.each]
-        return sorted(found, key=lambda pair: pair[1].result.merit)
+        minima = [(problem, minimum) for problem, distinct in self.families.values() for minimum in distinct.each]
+        return sorted(minima, key=lambda pair: pair[1].result.merit)

@@ -80,11 +80,11 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; found: number of followed descents to it; after: processor seconds until the first; tasks: key of that
-    one. variables: (M, n). starts, descents: numbers of starts, and of descents that were followed to their end.
-    as_built: (M, 3) the merit with the lens as built, by which the minima then are ordered, nan where a perturbed lens
-    fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused lens without errors;
-    tolerances: of which errors.
+    weights; times_reached: number of followed descents to it, the column `found`; after: processor seconds until the
+    first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of descents that were
+    followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are ordered, nan
+    where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused
+    lens without errors; tolerances: of which errors.
     """
 
     before: Lens
@@ -95,7 +95,7 @@ class Searched(Result):
     merit: Tensor
     focal_length: Tensor
     spots: Tensor
-    found: Tensor
+    times_reached: Tensor
     after: Tensor
     starts: int
     descents: int
@@ -103,6 +103,11 @@ class Searched(Result):
     stopped: str
     as_built: Tensor | None = None
     tolerances: str = ""
+
+    @property
+    def found(self) -> Tensor:
+        """`times_reached`, by its former name."""
+        return self.times_reached
 
     @property
     def lens(self) -> Lens:
@@ -117,7 +122,7 @@ class Searched(Result):
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             of_lens |= {"merit_as_built": merit, "expected_um": 1e3 * expected, "refocused_um": 1e3 * nominal}
-        return {**of_lens, "found": self.found, "seconds": self.after, **variables}
+        return {**of_lens, "found": self.times_reached, "seconds": self.after, **variables}
 
     def document(self) -> dict:
         counts = {"starts": self.starts, "descents": self.descents, "seconds": round(self.seconds, 3)}
@@ -144,7 +149,7 @@ class Searched(Result):
             shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
             shown |= {Column("expected", "µm", ".2f", "RMS\nas built"): 1e3 * expected}
             shown |= {Column("refocused", "µm", ".2f", "RMS\nno errors"): 1e3 * nominal}
-        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.found}
+        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.times_reached}
         return [Table(shown, title)]
 
     @style.styled
@@ -200,13 +205,13 @@ def searched(
     """The result: minima, the best first, each with its problem."""
     terms: list[tuple[float, float, float]] = []
     if as_built is not None:
-        terms = [_as_built(problem, one, as_built) for problem, one in each[:MOST]]
+        terms = [_as_built(problem, minimum, as_built) for problem, minimum in each[:MOST]]
         order = sorted(range(len(terms)), key=lambda k: (np.isnan(terms[k][0]), terms[k][0]))
         each, terms = [each[k] for k in order], [terms[k] for k in order]
     minima, lenses, tables = each[:MOST], [], []
-    for k, (problem, one) in enumerate(minima, 1):
-        variables = zip(problem.model.variables, one.result.x, strict=True)
-        lenses.append(_design(problem, one.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
+    for k, (problem, minimum) in enumerate(minima, 1):
+        variables = zip(problem.model.variables, minimum.result.x, strict=True)
+        lenses.append(_design(problem, minimum.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
         tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
     names = tuple(dict.fromkeys(name for table in tables for name in table))
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
@@ -214,13 +219,15 @@ def searched(
         before=lens,
         lenses=tuple(lenses),
         names=names,
-        tasks=tuple(one.task for _, one in minima),
+        tasks=tuple(minimum.task for _, minimum in minima),
         variables=tensor([[table.get(name, np.nan) for name in names] for table in tables]),
-        merit=tensor([one.result.merit for _, one in minima]),
-        focal_length=torch.stack([first_order(one).effective_focal_length.reshape(()) for one in lenses]),
-        spots=torch.stack([_spots(one) for one in lenses]),
-        found=torch.tensor([one.found for _, one in minima]),
-        after=tensor([one.seconds for _, one in minima]),
+        merit=tensor([minimum.result.merit for _, minimum in minima]),
+        focal_length=torch.stack(
+            [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
+        ),
+        spots=torch.stack([_spots(lens_of_minimum) for lens_of_minimum in lenses]),
+        times_reached=torch.tensor([minimum.descents for _, minimum in minima]),
+        after=tensor([minimum.seconds for _, minimum in minima]),
         starts=starts,
         descents=descents,
         stopped=stopped,
@@ -256,10 +263,10 @@ def _design(problem: Problem, x: np.ndarray, name: str) -> Lens:
     return replace(design, name=name, optimization_data=data)
 
 
-def _as_built(problem: Problem, one: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
+def _as_built(problem: Problem, minimum: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
     """The merit with the lens as built, and the RMS spot radius in mm expected and without errors, nan where a
     perturbed lens fails; the tolerances are those of the lens of the minimum."""
-    lens, x = problem.model.lens_at(one.result.x), one.result.x
+    lens, x = problem.model.lens_at(minimum.result.x), minimum.result.x
     try:
         term = settings.of(lens)
     except NoLight:
@@ -279,13 +286,13 @@ def _spots(lens: Lens) -> Tensor:
     return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
 
 
-def _draw(axes, found: Searched, k: int) -> None:
-    _draw_lens(axes, found.lenses[k])
-    spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
-    times = int(found.found[k])
+def _draw(axes, result: Searched, k: int) -> None:
+    _draw_lens(axes, result.lenses[k])
+    spots = ", ".join(f"{1e3 * float(radius):.1f}" for radius in result.spots[k])
+    times = int(result.times_reached[k])
     axes.set_title(
-        f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
-        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
+        f"{k + 1}: merit {style.number_text(float(result.merit[k]))}\n"
+        f"RMS spots {spots} µm; found by {times} of {result.descents} descents", fontsize=8,
     )  # fmt: skip
 
 
@@ -356,7 +363,7 @@ def search(
     started = time.monotonic()
     function = merit_for(lens, merit)
     free = design_variables(lens, vary)
-    if any(one.quantity == "glass" for one in free.variables):
+    if any(variable.quantity == "glass" for variable in free.variables):
         raise NoProblem(
             "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
         )
@@ -426,7 +433,7 @@ class _Run:
 
     def each(self) -> list[tuple[Problem, Minimum]]:
         """All minima, the best first, each with its problem."""
-        return [(self.whole, one) for one in self.minima.each]
+        return [(self.whole, minimum) for minimum in self.minima.each]
 
     def through(self, progress: Callable | None) -> None:
         """All batches. Raises SearchStopped."""
@@ -503,9 +510,11 @@ def _reversal(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
     if not np.isfinite(float(lens.surfaces[0].thickness)):
         return None
     variables, last = space.model.variables, len(lens.surfaces) - 2
-    at = {(one.surface, one.quantity): k for k, one in enumerate(variables)}
+    columns = {variable.address: k for k, variable in enumerate(variables)}
     partner = {"curvature": lambda k: last + 1 - k, "thickness": lambda k: last - k}
-    other = [(partner.get(one.quantity, lambda k: -1)(one.surface), one.quantity) for one in variables]
-    if any(address not in at for address in other):
+    other = [
+        (partner.get(variable.quantity, lambda k: -1)(variable.surface), variable.quantity) for variable in variables
+    ]
+    if any(address not in columns for address in other):
         return None
-    return np.array([at[address] for address in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)
+    return np.array([columns[address] for address in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)

@@ -201,9 +201,9 @@ def hadamard(least: int) -> np.ndarray:
     """A Hadamard matrix of the smallest order from `least` that Paley's and Sylvester's constructions have; its first
     column is 1."""
     order = max(least, 1)
-    while (found := _hadamard(order)) is None:
+    while (matrix := _hadamard(order)) is None:
         order += 1
-    return found
+    return matrix
 
 
 def _hadamard(order: int) -> np.ndarray | None:
@@ -216,8 +216,8 @@ def _hadamard(order: int) -> np.ndarray | None:
         squares[np.arange(1, q) ** 2 % q] = True
         character = np.where(squares, 1.0, -1.0)
         character[0] = 0.0
-        found = np.ones((order, order))
-        found[1:, 1:] = character[(np.arange(q) - np.arange(q)[:, None]) % q] - np.eye(q)
-        return found
+        matrix = np.ones((order, order))
+        matrix[1:, 1:] = character[(np.arange(q) - np.arange(q)[:, None]) % q] - np.eye(q)
+        return matrix
     half = _hadamard(order // 2) if order % 2 == 0 else None
     return None if half is None else np.block([[half, half], [half, -half]])

@@ -213,7 +213,7 @@ class _Limit(NamedTuple):
 
 def _parsed(text: str) -> list[_Limit]:
     """The limits of a text. Raises BadTolerance naming the word."""
-    found = []
+    limits = []
     for piece in text.split():
         match = _LIMITS.fullmatch(piece)
         if not match:
@@ -236,8 +236,8 @@ def _parsed(text: str) -> list[_Limit]:
             raise BadTolerance(
                 f"{piece!r}: the limits {minimum:g} to {maximum:g}; expected a positive number, or -1..3"
             )
-        found.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
-    return found
+        limits.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
+    return limits
 
 
 def _word(name: str) -> Word:
@@ -297,7 +297,7 @@ def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> 
 
     N fringes of λ/2 at the semi-diameter h are a part N λ |R|/h² of a radius R.
     """
-    radii, found = semi_diameters(lens), []
+    radii, changed = semi_diameters(lens), []
     for row in rows:
         if row.kind == "radius":
             k = row.surfaces[0]
@@ -305,8 +305,8 @@ def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> 
             if h > 0 and 100 * figure.fringes * 1e-3 * TEST_WAVELENGTH / (curvature * h * h) > figure.limit:
                 n = figure.fringes
                 row = dataclasses.replace(row, kind="power", minimum=-n, maximum=n, unit="fringes")
-        found.append(row)
+        changed.append(row)
     planes = [k for k in parts_of(lens).faces if _is_plane(lens, k) and radii[k] > 0]
-    known = {"distribution": found[0].distribution, "sigmas": found[0].sigmas} if found else {}
+    known = {"distribution": changed[0].distribution, "sigmas": changed[0].sigmas} if changed else {}
     n = figure.fringes
-    return found + [Tolerance("power", (k,), -n, n, source=figure.source, **known) for k in planes]
+    return changed + [Tolerance("power", (k,), -n, n, source=figure.source, **known) for k in planes]

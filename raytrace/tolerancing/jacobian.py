@@ -161,10 +161,10 @@ def jacobian(
             )
         errors = 0 if perturbation is None else len(perturbation.rows)
         start = torch.from_numpy(np.append(model.start, np.zeros(errors)))
-        at = with_tangents(start, torch.eye(len(start), dtype=start.dtype))
+        numbers = with_tangents(start, torch.eye(len(start), dtype=start.dtype))
         with torch.enable_grad():
-            moving = model.lens_at(at[: len(model.variables)])
-            moving = moving if perturbation is None else perturbation(at[len(model.variables) :], moving)
+            moving = model.lens_at(numbers[: len(model.variables)])
+            moving = moving if perturbation is None else perturbation(numbers[len(model.variables) :], moving)
         quantity, derivatives = derivatives_of(function, moving, len(start))
     rows = () if perturbation is None else Tolerances(perturbation.rows).labels
     return Jacobian(

@@ -48,7 +48,7 @@ def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Shar
     rays = sampling.fields.shape[1] * len(lens.wavelengths) * sampling.points.shape[-1]
     if trials * rays * len(lens.surfaces) >= WORTH_COMPILING:
         prepare()  # a batch of lenses is launched as one lens
-    found = study.half.new_zeros(trials, 2 + others)
+    results = study.half.new_zeros(trials, 2 + others)
     chunks = [range(first, min(first + CHUNK, trials)) for first in range(0, trials, CHUNK)]
     mine = (share or Share()).of(range(len(chunks)))
     stored = _Trials(checkpoint, study, seed) if checkpoint is not None else None
@@ -62,11 +62,11 @@ def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Shar
             rows = torch.cat([study.criterion.value(q)[:, None], light[:, None], changes], -1)
             if stored:
                 stored.put(part.start, rows)
-        found[part.start : part.stop] = torch.as_tensor(rows, dtype=found.dtype)
+        results[part.start : part.stop] = torch.as_tensor(rows, dtype=results.dtype)
         if bar is not None:
             bar.update(len(part))
     if bar is not None:
         bar.close()
     if share is not None and share.processes > 1:
-        found = total(found)
-    return torch.where(found[:, 0].isfinite(), found[:, 0], torch.nan), found[:, 2:], found[:, 1]
+        results = total(results)
+    return torch.where(results[:, 0].isfinite(), results[:, 0], torch.nan), results[:, 2:], results[:, 1]

@@ -162,7 +162,7 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
 
     def _solved(solve: Solve) -> Tensor | None:
         if solve.kind == "pickup":
-            change = step((solve.source, solve.quantity_of_source or solve.quantity))
+            change = step(solve.address_of_source)
             return None if change is None else solve.scale * change
         k, source = solve.surface, solve.source
         others = range(source, k) if source <= k else range(k + 1, source)
@@ -186,7 +186,7 @@ def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
     """The pickups and position solves of the lens, by surface and quantity."""
     data = lens.optimization_data
     solves = () if data is None else data.solves
-    return {(s.surface, s.quantity): s for s in solves if s.kind in ("pickup", "position") and s.operand is None}
+    return {s.address: s for s in solves if s.kind in ("pickup", "position") and s.operand is None}
 
 
 def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
@@ -213,17 +213,17 @@ def _carriers(lens: Lens, row: Tolerance) -> list[tuple[int, float]]:
     kind = KINDS[row.kind]
     if kind.elements or not (kind.sag or kind.motion):
         return []
-    source, found = row.surfaces[0], [(row.surfaces[0], 1.0)]
+    source, carriers = row.surfaces[0], [(row.surfaces[0], 1.0)]
     data = lens.optimization_data
     for solve in () if data is None or not kind.parameter else data.kept:
         picked = solve.kind == "PPAR" and solve.quantity == f"PARM {kind.parameter}" and len(solve.numbers) > 1
         if picked and int(solve.numbers[0]) == source:
-            found.append((solve.surface, solve.numbers[1]))
+            carriers.append((solve.surface, solve.numbers[1]))
     for solve in () if data is None or not kind.parameter else data.solves:
         picked = solve.kind == "pickup" and _IRREGULAR.get(solve.quantity) == kind.parameter
         if picked and solve.source == source and not lens.surfaces[solve.surface].is_break:
-            found.append((solve.surface, solve.scale))
-    return found
+            carriers.append((solve.surface, solve.scale))
+    return carriers
 
 
 # -- sag terms --------------------------------------------------------------------------------------------------------
@@ -271,9 +271,9 @@ def _move(
         before[first] += motions
         behind[last].insert(0, rows_of_both(rows_of_both(rows_back(way), back), way))
     for k in {*before, *behind, *of_surfaces}:
-        surface, own = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
-        front = [pose for pose in (*before[k], surface.before, *own) if pose is not None]
-        rear = [pose for pose in (*map(undone, own), surface.after) if pose is not None]
+        surface, of_surface = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
+        front = [pose for pose in (*before[k], surface.before, *of_surface) if pose is not None]
+        rear = [pose for pose in (*map(undone, of_surface), surface.after) if pose is not None]
         rows = rows_along(rear)
         for element in behind[k]:
             rows = rows_of_both(rows, element)
@@ -326,7 +326,7 @@ def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Ten
         if value.dim() and any(isinstance(scaled.path[-1], tuple) for scaled in operand.paths):
             raise BadTolerance(f"{_named(row)}: a coefficient that differs between configurations; expected one lens")
         lens = dataclasses.replace(
-            lens, operands=tuple(_raised(one, row, value) if one is operand else one for one in lens.operands)
+            lens, operands=tuple(_raised(old, row, value) if old is operand else old for old in lens.operands)
         )
         if row.configuration == lens.current_configuration:
             for path, factor, _ in operand.paths:
@@ -354,15 +354,15 @@ def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[in
 
     if any(differs(scaled.path) for operand in lens.operands for scaled in operand.paths):
         return ()
-    changed, found = dataclasses.replace(lens, surfaces=numbers), []
+    changed, operands = dataclasses.replace(lens, surfaces=numbers), []
     for operand in lens.operands:
         path = operand.paths[0].path if operand.paths and operand.numbers is not None else None
-        old, new = (None, None) if path is None else (configurations.part(one, path) for one in (lens, changed))
+        old, new = (None, None) if path is None else (configurations.part(view, path) for view in (lens, changed))
         if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old and not isinstance(path[-1], tuple):
             step = (new - old) / operand.paths[0].factor
             operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
-        found.append(operand)
-    return tuple(found)
+        operands.append(operand)
+    return tuple(operands)
 
 
 # -- what a lens does not have ----------------------------------------------------------------------------------------
@@ -421,8 +421,8 @@ def _check_nested(row: Tolerance, ranges: dict[tuple[int, int], Tolerance]) -> N
         if first == b or a == end:
             shared, group = (b if first == b else a), (min(a, first), max(b, end))
             message = f"its element shares the cemented surface {shared} with {a}-{b} ({other.kind}), and would move it"
-            own = (shared + 1, end) if first == b else (shared + 1, b)
-            fix = f"tolerance the cemented group {group}, or the surfaces {own} of the element behind it alone"
+            element = (shared + 1, end) if first == b else (shared + 1, b)
+            fix = f"tolerance the cemented group {group}, or the surfaces {element} of the element behind it alone"
             raise BadTolerance(f"{_named(row)}: {message} twice; {fix}")
         message = f"it shares a part of surfaces {a}-{b} ({other.kind}); expected one inside the other, or apart"
         raise BadTolerance(f"{_named(row)}: {message}")

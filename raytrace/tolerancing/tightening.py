@@ -55,14 +55,14 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
     if not increment > 0:
         raise ValueError(f"increment {increment:g}: expected a change of the criterion above 0")
     limits = torch.cat([tolerances.alone(tolerances.minimum), tolerances.alone(tolerances.maximum)])
-    found = change(limits)
-    reaches = (found > increment) | ~found.isfinite()  # where no light arrives the limit is too wide
+    changes = change(limits)
+    reaches = (changes > increment) | ~changes.isfinite()  # where no light arrives the limit is too wide
     few = limits[reaches]
     low, high = few.new_zeros(len(few)), few.new_ones(len(few))
     for _ in range(_HALVINGS if len(few) else 0):
         middle = 0.5 * (low + high)
-        found = change(few * middle[:, None])
-        good = found <= increment
+        changes = change(few * middle[:, None])
+        good = changes <= increment
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
     factors = torch.ones_like(reaches, dtype=few.dtype).masked_scatter(reaches, low)
     return scaled(tolerances, *(part[tolerances.leaders] for part in factors.chunk(2)))
@@ -92,21 +92,21 @@ def limited_to_yield(
     def reached(s: Tensor) -> tuple[float, float]:
         """The share of lenses that reach the goal, and its standard error."""
         off = good(s).double() - (model(s * checked.to(s))[0] <= goal).double()
-        found = (model(s * others.to(s))[0] <= goal).double()
-        error = (off.var() / len(off) + found.var() / len(found)).sqrt()
-        return float(found.mean() + off.mean()), float(error)
+        goal_met = (model(s * others.to(s))[0] <= goal).double()
+        error = (off.var() / len(off) + goal_met.var() / len(goal_met)).sqrt()
+        return float(goal_met.mean() + off.mean()), float(error)
 
     best = torch.ones(len(tolerances)).to(model.g)
-    there, error = reached(best)
-    if there >= share - error:
+    good_share, error = reached(best)
+    if good_share >= share - error:
         return tolerances
     wanted = share
     for _ in range(_SHIFTS):
         best = _least_tight(tolerances, model, goal, min(max(wanted, 0.0), 1 - 1 / _DRAWS), seed)
-        there, error = reached(best)
-        if abs(there - share) <= max(error, _CLOSE):
+        good_share, error = reached(best)
+        if abs(good_share - share) <= max(error, _CLOSE):
             return scaled(tolerances, best, best)
-        wanted += share - there
+        wanted += share - good_share
     best = best * _largest(lambda factor: float(good(factor * best).double().mean()) >= share, steps=12)
     return scaled(tolerances, best, best)
 
@@ -133,12 +133,12 @@ def _least_tight(tolerances: Tolerances, model: SecondOrder, goal: float, share:
         slope = ((y * (y - 1) / width) @ (by_errors * errors)) * s / len(q)
         return float(y.mean()) - share, slope.double().numpy()
 
-    found = minimize(
+    optimum = minimize(
         tightness, np.log(start.double().numpy()), jac=True, method="SLSQP", bounds=[(np.log(_LEAST), 0.0)] * len(ones),
         constraints={"type": "ineq", "fun": lambda u: excess(tuple(u))[0], "jac": lambda u: excess(tuple(u))[1]},
         options={"maxiter": 100, "ftol": 1e-7},
     )  # fmt: skip
-    best = torch.exp(torch.from_numpy(found.x)).to(ones)
+    best = torch.exp(torch.from_numpy(optimum.x)).to(ones)
     # The step itself in place of the logistic curve: all factors times one number.
     best = (best * _largest(lambda factor: met((factor * best).clamp(max=1.0)) >= share, 2.0)).clamp(max=1.0)
     if met(best) < share or float((1 / best).sum()) > float((1 / start).sum()):

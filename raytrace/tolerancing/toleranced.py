@@ -155,13 +155,13 @@ class Toleranced(Result):
         if self.given is None:
             return []
         pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
-        found = [(label, _factor(new, old)) for new, old, label in pairs]
-        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
+        factors = [(label, _factor(new, old)) for new, old, label in pairs]
+        return sorted((pair for pair in factors if pair[1] < 1), key=lambda pair: pair[1])
 
     def at_limit(self, number: int) -> int:
         """How many trials have a compensator, by its number from 0, at one of its limits."""
-        one, moved = self.tolerances.compensators[number], self.changes[:, number]
-        return int(((moved <= one.minimum) | (moved >= one.maximum)).sum())
+        compensator, moved = self.tolerances.compensators[number], self.changes[:, number]
+        return int(((moved <= compensator.minimum) | (moved >= compensator.maximum)).sum())
 
     def trial(self, number: int) -> Lens:
         """The lens of a trial, by its number from 0: perturbed, its compensators moved; a note has its criterion.
@@ -240,38 +240,38 @@ class Toleranced(Result):
 
     def summary(self) -> dict[str, float]:
         """Figures of the lens as built, in the unit of the criterion."""
-        found = {
+        summary = {
             "nominal": float(self.nominal),
             "estimated": float(self.estimated),
             "expected": float(self.expected),
         }
         if self.better == "smaller":
-            found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
-        found["second_order_holds"] = not self.holds
+            summary["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
+        summary["second_order_holds"] = not self.holds
         if len(self.trials):
             good = self.trials[~self.trials.isnan()]
             ends = (good * self.sign).aminmax() if len(good) else (torch.tensor(torch.nan),) * 2
-            found |= {"mean": float(good.mean()), "sigma": float(good.std()) if len(good) > 1 else math.nan}
-            found |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
-            found |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
-            found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+            summary |= {"mean": float(good.mean()), "sigma": float(good.std()) if len(good) > 1 else math.nan}
+            summary |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
+            summary |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
+            summary |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
         if self.goal is not None:
             reached = self.sign * self.predicted <= self.sign * self.goal
-            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
+            summary |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
             if len(self.trials):
-                found["yield"] = self.yield_at(self.goal)
-        return found
+                summary["yield"] = self.yield_at(self.goal)
+        return summary
 
     def tables(self) -> list[Table]:
-        found = self.summary()
-        about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
+        summary = self.summary()
+        about = [f"{self.title}: nominal {summary['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
         if self.configurations > 1:
             about[0] += f", of {self.configurations} configurations together"
-        root, failing = found.get("expected_root_mean_square"), int((self.minimum + self.maximum).isnan().sum())
+        root, failing = summary.get("expected_root_mean_square"), int((self.minimum + self.maximum).isnan().sum())
         about.append(
-            f"as built, expected by second order: mean {found['expected']:.6g}"
+            f"as built, expected by second order: mean {summary['expected']:.6g}"
             + (f", root mean square {root:.6g}" if root is not None else "")
-            + f"; estimated by RSS {found['estimated']:.6g}"
+            + f"; estimated by RSS {summary['estimated']:.6g}"
         )
         if self.holds:
             about.append(f"the second order does not hold: {self.holds}; rely on the trials")
@@ -280,36 +280,36 @@ class Toleranced(Result):
                 f"{failing} tolerances lose more than {100 * self.light_loss:g} % of the light at a limit: not in RSS"
             )
         if self.angle:
-            numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
-            numbers |= {"90 % within": found["percent_90"]} if len(self.trials) else {}
+            numbers = {"expected": summary["expected"], "estimated by RSS": summary["estimated"]}
+            numbers |= {"90 % within": summary["percent_90"]} if len(self.trials) else {}
             listed = ", ".join(f"{word} {1e3 * self.angle * number:.4g}" for word, number in numbers.items())
             about.append(f"as an angle, divided by the focal length, mrad: {listed}")
         if not self.tolerances.compensators:
             about.append("no compensator")
         if len(self.trials):
             about.append(
-                f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
-                f"best {found['best']:.6g}, worst {found['worst']:.6g}"
+                f"{len(self.trials):,} trials (seed {self.seed}): mean {summary['mean']:.6g}, "
+                f"σ {summary['sigma']:.4g}, best {summary['best']:.6g}, worst {summary['worst']:.6g}"
             )
-            if found["lost_light"] > 0:
+            if summary["lost_light"] > 0:
                 about.append(
-                    f"light lost in {int((self.lost > 0).sum())} trials, {100 * found['lost_light']:.3g} % at most; "
-                    f"{found['failed']} failed, by more than {100 * self.light_loss:g} %, and count as the worst"
+                    f"light lost in {int((self.lost > 0).sum())} trials, {100 * summary['lost_light']:.3g} % at most; "
+                    f"{summary['failed']} failed, by more than {100 * self.light_loss:g} %, and count as the worst"
                 )
             good = ~self.trials.isnan()
-            for k, one in enumerate(self.tolerances.compensators):
+            for k, compensator in enumerate(self.tolerances.compensators):
                 c = self.changes[good, k]
                 if not bool(c.any()):
-                    about.append(f"compensator {one}: it stays{', as it has no effect' * bool(len(c))}")
+                    about.append(f"compensator {compensator}: it stays{', as it has no effect' * bool(len(c))}")
                     continue
                 about.append(
-                    f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
-                    f"σ {float(c.std()):.4g}"
+                    f"compensator {compensator}: {float(c.min()):.4g} to {float(c.max()):.4g}, "
+                    f"mean {float(c.mean()):.4g}, σ {float(c.std()):.4g}"
                     + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
         if self.goal is not None:
-            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
-            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
+            traced = f", {100 * summary['yield']:.4g} % of the trials" if len(self.trials) else ""
+            share = f"{100 * summary['yield_by_second_order']:.4g} % by second order"
             bound = "at most" if self.sign > 0 else "at least"
             about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
         if self.given is not None:
@@ -320,13 +320,13 @@ class Toleranced(Result):
             )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about, self.tolerances.notes)]
+        tables = [Table(self.columns(), about, self.tolerances.notes)]
         if len(self.trials):
             bound = "within" if self.sign > 0 else "above"
-            found.append(
+            tables.append(
                 Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
             )
-        return found
+        return tables
 
     def document(self) -> dict:
         about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}

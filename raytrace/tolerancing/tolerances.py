@@ -118,21 +118,21 @@ class Tolerances(Result):
 
     def tables(self) -> Sequence[Table]:
         title = [f"{len(self.rows)} tolerances, fringes at {self.test_wavelength:g} µm"]
-        notes = [f"compensator: {one}" for one in self.compensators]
+        notes = [f"compensator: {compensator}" for compensator in self.compensators]
         return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
 
     def document(self) -> dict:
         """The rows and compensators as plain values."""
 
         def plain(row) -> dict:
-            found = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
-            stated = {name: part for name, part in found.items() if part not in ("", None, ())}
+            fields = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
+            stated = {name: part for name, part in fields.items() if part not in ("", None, ())}
             return {name: number(part) if isinstance(part, float) else part for name, part in stated.items()}
 
         return {
             "test_wavelength": self.test_wavelength,
             "tolerances": [plain(row) for row in self.rows],
-            "compensators": [plain(one) for one in self.compensators],
+            "compensators": [plain(compensator) for compensator in self.compensators],
             "unread": list(self.unread),
         }
 

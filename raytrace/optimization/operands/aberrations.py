@@ -53,9 +53,9 @@ def unvignetted(lens: Lens, field: tuple[float, float], pupil: tuple[float, floa
     """The pupil point that vignetting factors take to a point of the whole pupil, by default its centre."""
     if lens.fields.vignetting is None:
         return pupil
-    at = float(lens.fields.extent) * torch.tensor(field, dtype=torch.float64)[:, None]
+    angles = float(lens.fields.extent) * torch.tensor(field, dtype=torch.float64)[:, None]
     corners = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    shift, *ends = vignette(lens, at, corners).numpy().T
+    shift, *ends = vignette(lens, angles, corners).numpy().T
     matrix = np.stack([end - shift for end in ends], -1)
     return tuple(np.linalg.solve(matrix, np.array(pupil) - shift).tolist())
 
@@ -219,11 +219,11 @@ def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tup
         return _by_analysis(errors)
     close = [tuple(NEAR_AXIS * part for part in field) for field in fields]
     far, near = (
-        np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, at, strict=True)])
-        for at in (fields, close)
+        np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, places, strict=True)])
+        for places in (fields, close)
     )
     meridian = np.array([along(field) for field in fields]).T
-    extent, close_extent = (np.array([_extent(planner, field) for field in at]) for at in (fields, close))
+    extent, close_extent = (np.array([_extent(planner, field) for field in places]) for places in (fields, close))
 
     def evaluate(context: EvaluationContext) -> RowValues:
         hits, close_hits = context.hits(far), context.hits(near)

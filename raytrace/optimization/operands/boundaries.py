@@ -153,8 +153,8 @@ class Gaps:
         """mm (S,) of the surfaces on both sides of every gap, each at its own semi-diameter or both at the rim."""
         sizes, every = self.semi_diameters.at(context), np.arange(len(self.end))
         if code < RIM:
-            own = self._sag(context, code, every, sizes)
-            return own, own[self.end]
+            sags_there = self._sag(context, code, every, sizes)
+            return sags_there, sags_there[self.end]
         rim = rims(sizes, self.end, ~self.is_air & (self.end > every))
         return tuple(self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
 

@@ -171,7 +171,9 @@ def _turned(beams: Sequence[Pupil], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Components (..., B, R) of all rays, one beam after the other: (2, ..., B, R)."""
     size = len(beams[0].colours)
     places = [(..., slice(k * size, (k + 1) * size), slice(None)) for k in range(len(beams))]
-    return np.concatenate([np.stack(beam.turned(x[at], y[at])) for beam, at in zip(beams, places, strict=True)], -2)
+    return np.concatenate(
+        [np.stack(beam.turned(x[chosen], y[chosen])) for beam, chosen in zip(beams, places, strict=True)], -2
+    )
 
 
 def modulations(
@@ -258,8 +260,8 @@ class Wave:
         frequencies = sorted({frequency for frequency, _ in self.asked})
         scene, shares = _scene(lens, self.field, self.colours), _shares(self.colours, lens.wavelengths)
         both = mtf_on_grid(scene, lens.wavelengths.new_tensor(frequencies), shares, least=self.least)
-        at = {frequency: k for k, frequency in enumerate(frequencies)}
-        return [sum(share * m[0, at[f]] for share, m in zip(_SHARES[s], both, strict=True)) for f, s in self.asked]
+        columns = {frequency: k for k, frequency in enumerate(frequencies)}
+        return [sum(share * m[0, columns[f]] for share, m in zip(_SHARES[s], both, strict=True)) for f, s in self.asked]
 
     def __call__(self, context: EvaluationContext) -> Sequence | None:
         if self._last[0] is not context:
@@ -299,11 +301,11 @@ def _by_few_rays(context: EvaluationContext, waves: AllWaves) -> dict[Wave, list
         asked = {(f, axis) for wave in some for f, s in wave.asked for axis in range(2) if _SHARES[s][1 - axis]}
         sections = [Section(*each) for each in sorted(asked)]
         modulation, suffice = modulations(context, [wave.beam for wave in some], sections)
-        at = {section: k for k, section in enumerate(sections)}
+        columns = {section: k for k, section in enumerate(sections)}
         for k in np.flatnonzero(suffice):
-            by_section = {section: modulation[k][place] for section, place in at.items()}
+            by_section = {section: modulation[k][place] for section, place in columns.items()}
             numbers[some[k]] = [
-                _mean(s, lambda axis, f=f, of=by_section: of[Section(f, axis)]) for f, s in some[k].asked
+                _mean(s, lambda axis, f=f, values=by_section: values[Section(f, axis)]) for f, s in some[k].asked
             ]
     return numbers
 

@@ -189,8 +189,8 @@ class Planner:
         last = self.image if surface is None else self.checked(line, surface)
         if last == 0 and not is_flat(self.lens.surfaces[0]):
             raise BadRow(line, "names surface 0, a curved or tilted object, on which rays are not evaluated")
-        of, at = line.field if field is None else field, line.pupil if pupil is None else pupil
-        return self.ask(number, of, at, surface=last)
+        of_field, of_pupil = line.field if field is None else field, line.pupil if pupil is None else pupil
+        return self.ask(number, of_field, of_pupil, surface=last)
 
     def ask(self, wavelength: int, field, pupil, *, surface: int | None = None, clips: bool = False) -> int:
         """The number of any ray behind a surface, the image by default; clips: of those that apertures may stop."""
@@ -232,10 +232,10 @@ class EvaluationContext:
 
     def hits(self, rays: np.ndarray, *, surface: int | None = None, clips: bool = False) -> Hits:
         """Rays by their numbers behind a surface, the image by default; surface, clips: those of `Planner.ask`."""
-        at = self.planner.image if surface is None else surface, clips
-        if at not in self._hits:
-            self._hits[at] = self.planner.bundles[at].hits(self.state)
-        return self._hits[at].at(rays)
+        of_surface = self.planner.image if surface is None else surface, clips
+        if of_surface not in self._hits:
+            self._hits[of_surface] = self.planner.bundles[of_surface].hits(self.state)
+        return self._hits[of_surface].at(rays)
 
     def starts(self, rays: np.ndarray, surface: int) -> Hits:
         """Rays behind a surface at their launch, before surface 1 and in its axes."""

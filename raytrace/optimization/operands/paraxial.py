@@ -143,7 +143,7 @@ def _across_rims(lines: Sequence[Line], planner: Planner, *, section: str) -> Ev
     def through(side: int) -> np.ndarray:
         each = zip(lines, fields, rims, waves, strict=True)
         return np.array(
-            [planner.ray(at, field=h, pupil=(side * x, side * y), wavelength=w) for at, h, (x, y), w in each]
+            [planner.ray(surface, field=h, pupil=(side * x, side * y), wavelength=w) for surface, h, (x, y), w in each]
         )
 
     ahead, back = through(1), through(-1)
@@ -221,7 +221,7 @@ _AT_WAVELENGTH = (
         0,
     ),
     ("PIMH", _image_height, "height of the largest field in the paraxial image", 1),
-    ("PETZ", lambda *at: quotient(1.0, _petzval_curvature(*at)), "radius of the Petzval surface", 1),
+    ("PETZ", lambda *ray: quotient(1.0, _petzval_curvature(*ray)), "radius of the Petzval surface", 1),
     ("PETC", _petzval_curvature, "curvature of the Petzval surface", -1),
 )
 

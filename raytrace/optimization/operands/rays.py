@@ -85,13 +85,13 @@ def _by_surface(
     surfaces, rays = np.array([line.row.integers[0] for line in lines]), {}
     for surface in set(surfaces.tolist()):
         here = [line for line in lines if line.row.integers[0] == surface]
-        rays[surface] = [planner.rays(here, surface=at) for at in range(surface - also_before, surface + 1)]
+        rays[surface] = [planner.rays(here, surface=k) for k in range(surface - also_before, surface + 1)]
 
     def evaluate(context: EvaluationContext) -> RowValues:
         count = context.state.count
         values, slopes = np.full(len(lines), np.nan), np.zeros((count, len(lines)))
-        for surface, (*before, at) in rays.items():
-            numbers = known(*number(context, context.hits(at, surface=surface), surface, *before))
+        for surface, (*before, ray) in rays.items():
+            numbers = known(*number(context, context.hits(ray, surface=surface), surface, *before))
             values[surfaces == surface] = value_of(numbers)
             slopes[:, surfaces == surface] = slope_of(numbers, count)
         return RowValues(Dual(values, slopes) if count else values)

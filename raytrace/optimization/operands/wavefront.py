@@ -85,7 +85,7 @@ def opd_of(
     beams: (wavelength from 0, field) of each; clips: whether apertures stop rays, though not chief rays.
     """
     numbers = {beam: number for number, beam in enumerate(dict.fromkeys(beams))}
-    of = np.array([numbers[beam] for beam in beams])
+    rows = np.array([numbers[beam] for beam in beams])
     chief = centres = np.array([planner.ask(w, field, (0.0, 0.0)) for w, field in numbers])
     if planner.conventions.opd_chief == "primary":
         centres = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in numbers])
@@ -98,8 +98,8 @@ def opd_of(
         hits, chief_hits, about = context.hits(rays, clips=clips), context.hits(chief), context.hits(centres)
         sphere, index = sphere_of(context, about, bent), image_index(context, wavelength)
         zero = path_to_reference_sphere(chief_hits, *sphere, index)
-        difference = (path_to_reference_sphere(hits, *sphere.at(of), index[of]) - zero[of]) / waves[of]
-        return hits.valid & (chief_hits.valid & about.valid)[of], difference
+        difference = (path_to_reference_sphere(hits, *sphere.at(rows), index[rows]) - zero[rows]) / waves[rows]
+        return hits.valid & (chief_hits.valid & about.valid)[rows], difference
 
     return opd
 
