@@ -60,7 +60,7 @@ def encoding(content: bytes) -> str:
     return "utf-8"
 
 
-def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
+def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
     """Replace a file as a whole or not at all: `write` fills a temporary file, which is then renamed.
 
     The temporary file, in the same folder, has no name until complete, where the system allows that: a killed process

@@ -6,6 +6,7 @@ Every rule of the disc returns points (2, P) and weights (P,) that sum to 1 and 
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -25,9 +26,9 @@ def _at_least_one(rule: str, **sizes: float) -> None:
             raise ValueError(f"{rule}: `{name}` is {size}; expected 1 or more")
 
 
-def _afford(count: float, what: str, option: str) -> None:
-    """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
-    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer `{option}`")
+def _afford(count: float, rule: str, option: str) -> None:
+    """Raise OverBudget for a rule whose `count` points do not fit into memory."""
+    afford(_POINT_BYTES * count, f"{rule}: {count:.3g} points of the pupil", helps=f"ask for fewer `{option}`")
 
 
 def gauss_rings(
@@ -155,12 +156,14 @@ def _equal(points: np.ndarray, dtype: torch.dtype, device: torch.device | None) 
     return _tensors(points, np.full(count, 1.0 / count), dtype, device)
 
 
-def _tensors(points: np.ndarray, weights: np.ndarray, dtype, device) -> tuple[Tensor, Tensor]:
+def _tensors(
+    points: np.ndarray, weights: np.ndarray, dtype: torch.dtype, device: torch.device | None
+) -> tuple[Tensor, Tensor]:
     return torch.as_tensor(points, dtype=dtype, device=device), torch.as_tensor(weights, dtype=dtype, device=device)
 
 
-#: Samplings by name, each called with one size: rings, points across, or points; and that size where none is given.
-SAMPLINGS = {
+#: Samplings by name: the rule, the option of its size (rings, points across, or points) and the default of that size.
+SAMPLINGS: dict[str, tuple[Callable[..., tuple[Tensor, Tensor]], str, int]] = {
     "gauss": (gauss_rings, "rings", 12),
     "hexapolar": (hexapolar, "rings", 12),
     "square": (square, "points", 32),
@@ -189,10 +192,10 @@ def sampled(
     given = {"rings": rings, "points": points}
     wrong = "points" if counted == "rings" else "rings"
     if given[wrong] is not None:
-        takers = ", ".join(name for name, (_, what, _) in SAMPLINGS.items() if what == wrong)
+        takers = ", ".join(name for name, (_, option, _) in SAMPLINGS.items() if option == wrong)
         raise ValueError(f"`{wrong}` belongs to `sampling={takers}`; {sampling} takes `{counted}`")
-    own = {"seed": seed} if rule in (sobol, random) else {}
-    return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)
+    seeds = {"seed": seed} if rule in (sobol, random) else {}
+    return rule(size if given[counted] is None else given[counted], **seeds, dtype=dtype, device=device)
 
 
 @value

@@ -89,10 +89,10 @@ class Solve:
 
     def __str__(self) -> str:
         if self.kind == "pickup" and self.operand is None:
-            named = self.quantity_of_source or self.quantity
+            quantity = self.quantity_of_source or self.quantity
             scale = "" if self.scale == 1 else f"{self.scale:g} × "
             offset = "" if self.offset == 0 else f" {'-' if self.offset < 0 else '+'} {abs(self.offset):g}"
-            return f"{_where(self)} = {scale}{named} of surface {self.source}{offset}"
+            return f"{_where(self)} = {scale}{quantity} of surface {self.source}{offset}"
         numbers = " ".join(f"{number:g}" for number in self.numbers)
         return f"{_where(self)}: {self.kind} {numbers}".rstrip()
 
@@ -124,7 +124,7 @@ class Row:
     text: str = ""
     further: tuple[float, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, size, zero in (("integers", 2, 0), ("numbers", 4, 0.0)):
             given = getattr(self, name)
             if isinstance(given, tuple) and len(given) == size:
@@ -139,7 +139,9 @@ class Row:
         """Name of the operand, or of its function."""
         if isinstance(self.operand, str):
             return self.operand
-        return getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
+        return str(
+            getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
+        )
 
 
 @dataclass(frozen=True, slots=True)
