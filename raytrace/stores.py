@@ -23,13 +23,16 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, TypeAlias, TypeVar
 
 from raytrace.files import NotWritten, append_text, read_bytes, write_json, write_text
 from raytrace.shards import share
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
-Check = Callable[[object], object]
+Check: TypeAlias = Callable[[Any], Any]
+
+Checked = TypeVar("Checked")
 
 _MOST = 1 << 30  # bytes of a file
 _REPORTED = 5  # damaged lines of a file
@@ -223,7 +226,7 @@ def read_file(
         raise error(f"{place}: {reason}; {advice}") from reason
 
 
-def read_document(path: str | os.PathLike, check: Check, error: type[ValueError], advice: str) -> object:
+def read_document(path: str | os.PathLike, check: Check, error: type[ValueError], advice: str) -> Any:
     """The value of a JSON file. Raises as `read_file`."""
     return read_file(path, lambda content: check(parsed(content)), error, advice)
 
@@ -379,7 +382,7 @@ class Store:
 class Document(Store):
     """A file of one record, {"of": the identity, …}, replaced as a whole."""
 
-    def read(self, check: Check) -> object:
+    def read(self, check: Callable[[Any], Checked]) -> Checked:
         """The checked record. Raises OSError and the errors of the kind."""
 
         def checked(value: object) -> object:
@@ -402,7 +405,7 @@ class Records(Store):
         super().__init__(path, of, kind)
         self.lines = None if path is None else Lines(path, check, head=mapped(anything))
 
-    def read(self) -> list[tuple[int, object]]:
+    def read(self) -> list[tuple[int, Any]]:
         """Every record with the number of its line; a missing file is started.
 
         Warns DamagedLine. Raises OSError and the errors of the kind.

@@ -153,7 +153,7 @@ def mutations(document: dict):
         inside[place[-1]] = marker
         text = json.dumps(changed)
         for name, content in STRANGE.items():
-            if (place, name) in {(("descent", "scale"), "null"), (("descent", "best"), "null")}:
+            if (place, name) == (("descent", "best"), "null"):
                 continue
             if place[-1] == 7 and name in ("text", "lone half"):
                 continue

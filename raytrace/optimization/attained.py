@@ -96,8 +96,8 @@ def conditions_attained(problem: Problem, evaluated: Evaluated) -> Iterator[Atta
         missed = abs(number - target) if relation == "=" else RELATIONS[relation] * (number - target)
         met = bool(missed <= EXACT * max(abs(target), 1.0))
         configuration = (condition.configuration or model.lens.current_configuration) if len(model.views) > 1 else 0
-        place = {"configuration": configuration, "surface": 0 if met else surface}
-        yield Attained(name_of_condition(condition), relation, target, number, met, **place)
+        surface = 0 if met else surface
+        yield Attained(name_of_condition(condition), relation, target, number, met, 0, configuration, surface)
 
 
 def name_of_condition(condition: Condition) -> str:
@@ -128,7 +128,7 @@ def _number_of(
         return row.target + side * excess / problem.evaluation.factors[k], surface
     if operand.bounds and operand.refers:
         number = float(evaluated.values[row.integers[0] - 1])
-        number = abs(number) if row.operand.startswith("AB") else number
+        number = abs(number) if row.name.startswith("AB") else number
     return number, 0
 
 

@@ -120,7 +120,7 @@ class Checkpoint:
                 "factor": float(state.factor),
                 "share": float(state.share),
                 "price": float(state.price),
-                "scale": None if state.scale is None else state.scale.tolist(),
+                "scale": state.scale.tolist(),
                 "evaluations": state.evaluations,
                 "history": [list(dataclasses.astuple(cycle)) for cycle in descent.history],
             }
@@ -155,7 +155,7 @@ def read_checkpoint(path: str | PathLike, about: Mapping[str, object], names: Se
         return Cycle(*(column(cell) for column, cell in zip(columns, cells, strict=True)))
 
     of_solver = {"x": vector, **dict.fromkeys(("damping", "factor", "share", "price"), number(0))}
-    of_solver |= {"scale": either(exactly(None), vector), "evaluations": whole()}
+    of_solver |= {"scale": vector, "evaluations": whole()}
     of_paths = {"path": whole(0, len(PATHS) - 1), "start": vector, "best": either(exactly(None), best)}
     descent_of = record({**of_paths, **of_solver, "before": listed(whole(), 2, 2), "history": listed(cycle)})
 

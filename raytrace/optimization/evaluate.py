@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt, value
-from raytrace.maths.result import Column, Result, Table, rows
+from raytrace.maths.result import Column, Columns, Result, Table, rows
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.optimization.operands.table import OPERANDS
@@ -17,6 +18,9 @@ from raytrace.plotting.style import FAINT, field_colours, new_figure, number_tex
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.launch import warn_of_filling
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _WHOLE = 40  # rows up to which each has a line
 _TOGETHER = 3  # rows of one field that share a line in longer tables
@@ -97,7 +101,7 @@ class MeritResult(Result):
             lines.append(f"{lost} rows have lost their ray")
         groups, valued = [*self._groups()], self.valued()
         first = [group[0] for group in groups]
-        columns = {
+        columns: Columns = {
             Column("conf."): self.configurations[first],
             Column("row"): [self._numbers(group) for group in groups],
             Column("operand", form="<"): [valued[k].name for k in first],
@@ -144,7 +148,7 @@ class MeritResult(Result):
             yield from [alike] if len(alike) >= _TOGETHER else ([k] for k in alike)
 
     @styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """A bar for every operand and field, the largest part first; rays of a field share one.
 
         Bars are coloured by operand; the smallest are summed in the last bar.
@@ -222,7 +226,9 @@ def evaluate(
     the file's. configuration: its rows alone. each: list every row in the text. Of a batch the merit (L,) has
     derivatives by every number of the lenses. Raises BadMerit, UnknownOperand.
     """
-    function = merit_for(lens if lens.count is None else lens[0], merit, configuration and [configuration])
+    function = merit_for(
+        lens if lens.count is None else lens[0], merit, configuration if configuration is None else [configuration]
+    )
     if lens.count is None:
         warn_of_filling(lens, field_points(None, like=lens))
     of_rows = configurations_of(function, lens.current_configuration)

@@ -16,11 +16,13 @@ so that NJ_p holds Schur's complement of the Hessian. The best few are optimised
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -29,7 +31,7 @@ from scipy.spatial import ConvexHull, QhullError
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
-from raytrace.optimization.least_squares import SumOfSquares, least_squares
+from raytrace.optimization.least_squares import Evaluate, SumOfSquares, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
@@ -112,13 +114,13 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normal, normal @ low - planes[:, -1]
 
 
-def catalogs_of(lens: Lens, catalog: Sequence[str | Path] = ()) -> tuple[Catalog, ...]:
+def catalogs_of(lens: Lens, catalog: Sequence[str | PathLike] = ()) -> tuple[Catalog, ...]:
     """Catalogs by their names or AGF files; without any those that the lens names, else SCHOTT. Raises CatalogError."""
     shipped = [name for name in lens.catalogs if name not in missing_catalogs([name])]
     catalogs = []
     for name in catalog or shipped or ("SCHOTT",):
         if Path(name).suffix or Path(name).is_file():
-            catalogs.append(load(name))
+            catalogs.append(load(Path(name)))
             continue
         try:
             catalogs.append(shipped_catalog(str(name)))
@@ -173,6 +175,10 @@ WORDS = {
 }
 
 
+#: Candidates that were optimised: name, predicted and reached merit.
+Trials: TypeAlias = tuple[tuple[str, float, float], ...]
+
+
 @dataclass(frozen=True)
 class GlassStep:
     """One step of the choice.
@@ -190,9 +196,9 @@ class GlassStep:
     catalog: str = ""
     replaced: str = ""
     predicted: float = float("nan")
-    tried: tuple[tuple[str, float, float], ...] = ()
+    tried: Trials = ()
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         of_surface = {"surface": self.surface, "glass": self.name, "catalog": self.catalog, "predicted": self.predicted}
         tried = [dict(zip(("glass", "predicted", "reached"), trial, strict=True)) for trial in self.tried]
         more = {**of_surface, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
@@ -208,17 +214,23 @@ class GlassStep:
 
 @dataclass(frozen=True)
 class Design:
-    """A state of the choice: variables x (n,) but for glasses, the glasses, and the state of the solver."""
+    """A lens of the choice: variables x (n,) without those of glasses, and the glasses by surface."""
 
     x: np.ndarray
     glasses: dict[int, Glass]
+
+
+@dataclass(frozen=True)
+class DescendedDesign(Design):
+    """A design at the end of a descent, with its merit function there."""
+
     state: SumOfSquares
 
     @property
     def merit(self) -> float:
         return float(np.sqrt(self.state.cost))
 
-    def rank(self, charged: float = 1.0) -> tuple:
+    def rank(self, charged: float = 1.0) -> tuple[float, float, float]:
         """Fewer failed rays, then conditions met, then a lower merit."""
         missed = float(self.state.missed.max(initial=0.0))
         return self.state.lost, missed if missed > _MET else 0.0, self.merit * charged
@@ -273,7 +285,7 @@ class Choice:
         cycles: int | None = None,
         until: float = np.inf,
         keep: Callable[[Stored, float], None] | None = None,
-        **options,
+        **options: Any,
     ):
         """cycles: of a stage, at most; until: a time of `time.monotonic`; keep: called with the best state while
         glasses are exchanged, and its merit; options: of Problem."""
@@ -282,7 +294,8 @@ class Choice:
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
         self.until, self.started, self.evaluations = until, time.monotonic(), 0
         self.descended = 0  # cycles
-        self.steps, self.keep = [], keep or (lambda stored, merit: None)
+        self.steps: list[GlassStep] = []
+        self.keep = keep or (lambda stored, merit: None)
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
@@ -299,17 +312,17 @@ class Choice:
             candidates[k] = glasses, np.concatenate(numbers)
         return candidates
 
-    def run(self, x: np.ndarray, stored: Stored | None = None) -> Design:
+    def run(self, x: np.ndarray, stored: Stored | None = None) -> DescendedDesign:
         """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
         glasses_of_lens = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
         if stored is not None and stored.glasses:
             chosen = glasses_of_lens | {k: self._named(k, *stored_glass) for k, stored_glass in stored.glasses.items()}
-            self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
+            self.best = DescendedDesign(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
             if stored.descent is None:  # else all exchanges were done
                 with suppress(KeyboardInterrupt):  # the best so far
                     self.swap(stored.tested)
             return self.best
-        first = self.descend(Design(x, glasses_of_lens, None), (), self.cycles)
+        first = self.descend(Design(x, glasses_of_lens), (), self.cycles)
         self.steps.append(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
@@ -317,7 +330,7 @@ class Choice:
             if known and time.monotonic() > self.until:
                 return first
             snapped = self.snapped(first, known=known)
-            self.best = min(first, snapped, key=Design.rank) if known else snapped
+            self.best = min(first, snapped, key=DescendedDesign.rank) if known else snapped
             self._keep(())
             self.swap()
         return self.best
@@ -329,15 +342,15 @@ class Choice:
                 return glass
         raise BadCheckpoint(f"the checkpoint's glass {name} of {catalog}, surface {surface}: no catalog given has it")
 
-    def _keep(self, tested: Sequence[int]) -> None:
+    def _keep(self, tested: Iterable[int]) -> None:
         glasses = {k: (glass.catalog, glass.name) for k, glass in self.best.glasses.items()}
         self.keep(Stored(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
-    def snapped(self, design: Design, *, known: bool) -> Design:
+    def snapped(self, design: DescendedDesign, *, known: bool) -> DescendedDesign:
         """The design with model glasses first, then with glasses of the catalogs in their places, one by one; as it is
         where no time is left for that, and its glasses are known ones."""
         first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
-        design = self.descend(Design(design.x, model, None), self.surfaces, self.cycles)
+        design = self.descend(Design(design.x, model), self.surfaces, self.cycles)
         self.steps.append(GlassStep("model", design.merit, self.seconds))
         waiting = list(self.surfaces)
         while waiting:
@@ -364,7 +377,7 @@ class Choice:
         )
         return Problem(model, self.rows, self.conditions, **self.options)
 
-    def limited(self, problem: Problem, open_: Sequence[int]):
+    def limited(self, problem: Problem, open_: Sequence[int]) -> Evaluate:
         """The states of a problem with the hull of the glasses as limits."""
         count, k = len(self.model.variables), self.pool.count
         slope = np.zeros((0, count + k * len(open_)))
@@ -377,7 +390,7 @@ class Choice:
         def state(x: np.ndarray, derivatives: bool) -> SumOfSquares:
             reached = problem.state(x, derivatives)
             limits = np.concatenate([reached.limits, slope @ x - reach])
-            slopes = None if reached.limits_slope is None else np.vstack([reached.limits_slope, slope])
+            slopes = np.vstack([reached.limits_slope, slope]) if derivatives else reached.limits_slope
             return dataclasses.replace(reached, limits=limits, limits_slope=slopes)
 
         return state
@@ -386,7 +399,7 @@ class Choice:
         numbers = [design.glasses[k].coefficients.numpy()[: self.pool.count] for k in open_]
         return np.concatenate([design.x, *numbers])
 
-    def descend(self, design: Design, open_: Sequence[int], cycles: int) -> Design:
+    def descend(self, design: Design, open_: Sequence[int], cycles: int) -> DescendedDesign:
         """The design at its minimum; glasses of surfaces `open_` are variable model glasses."""
         state = self.limited(self.problem(design.glasses, open_), open_)
         rest = np.full(self.pool.count * len(open_), np.inf)
@@ -401,12 +414,12 @@ class Choice:
         end = descent.state.x
         numbers = {s: end[count + k * j : count + k * (j + 1)] for j, s in enumerate(open_)}
         glasses = design.glasses | {s: self.pool.model(of_glass) for s, of_glass in numbers.items()}
-        return Design(end[:count], glasses, descent.state)
+        return DescendedDesign(end[:count], glasses, descent.state)
 
     def predicted(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
         """For surfaces the predicted merits (G,) of their candidates; glasses of `open_` follow too."""
         models = {k: self.pool.model(self.numbers(design, k)) for k in self.surfaces}
-        modelled = Design(design.x, models, None)
+        modelled = Design(design.x, models)
         x = self._start(modelled, self.surfaces)
         state = self.limited(self.problem(models, self.surfaces), self.surfaces)(x, True)
         count, k = len(self.model.variables), self.pool.count
@@ -425,7 +438,9 @@ class Choice:
         glass = design.glasses[surface]
         return self.pool.numbers_of(glass) if glass.catalog else glass.coefficients.numpy()[: self.pool.count]
 
-    def tried(self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]):
+    def tried(
+        self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]
+    ) -> tuple[DescendedDesign, Glass, float, Trials] | None:
         """(design, glass, predicted merit, all that were tried) of the best of the promising candidates."""
         (glasses, numbers), current = self.candidates[surface], design.glasses[surface]
         width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
@@ -437,18 +452,19 @@ class Choice:
                 candidates.append(int(i))
             if len(candidates) == TRIED:
                 break
-        best, tried = None, []
+        best: tuple[DescendedDesign, Glass, float] | None = None
+        tried: list[tuple[str, float, float]] = []
         for i in candidates:
             if tried and time.monotonic() > self.until:
                 break
-            trial = Design(design.x, design.glasses | {surface: glasses[i]}, None)
+            trial = Design(design.x, design.glasses | {surface: glasses[i]})
             end = self.descend(trial, open_, min(TRIAL_CYCLES, self.cycles))
             tried.append((glasses[i].name, float(merits[i]), end.merit))
             if best is None or end.rank(charge(glasses[i])) < best[0].rank(charge(best[1])):
                 best = end, glasses[i], float(merits[i])
         return (*best, tuple(tried)) if best else None
 
-    def snap(self, design: Design, waiting: list[int]) -> Design:
+    def snap(self, design: Design, waiting: list[int]) -> DescendedDesign:
         """The design in which the element that loses most by it has taken a glass of the catalogs."""
         merits = self.predicted(design, waiting, waiting)
         surface = max(waiting, key=lambda k: float(merits[k].min()))
@@ -459,17 +475,17 @@ class Choice:
 
     def swap(self, tested: Sequence[int] = ()) -> None:
         """Exchange one glass at a time, the most promising first, until none helps; tested: where none has helped."""
-        tested = set(tested)
+        left_alone = set(tested)
         for _ in range(_ROUNDS * len(self.surfaces)):
-            left = [k for k in self.surfaces if k not in tested]
+            left = [k for k in self.surfaces if k not in left_alone]
             if not left or time.monotonic() > self.until:
                 return
             merits = self.predicted(self.best, left, ())
             surface = min(left, key=lambda k: float(merits[k].min()))
-            tested.add(surface)
+            left_alone.add(surface)
             if self._swap(surface, merits[surface]):
-                tested = {surface}
-            self._keep(tested)
+                left_alone = {surface}
+            self._keep(left_alone)
 
     def _swap(self, surface: int, merits: np.ndarray) -> bool:
         """Exchange a glass, if that helps."""
@@ -487,6 +503,15 @@ class Choice:
         self._took("swap", surface, glass, before.name, predicted, end, tried)
         return True
 
-    def _took(self, kind: str, surface: int, glass: Glass, replaced: str, predicted: float, design: Design, tried):
+    def _took(
+        self,
+        kind: str,
+        surface: int,
+        glass: Glass,
+        replaced: str,
+        predicted: float,
+        design: DescendedDesign,
+        tried: Trials,
+    ) -> None:
         taken = surface, glass.name, glass.catalog, replaced, predicted, tried
         self.steps.append(GlassStep(kind, design.merit, self.seconds, *taken))

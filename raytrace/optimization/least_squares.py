@@ -20,6 +20,7 @@ Source: Levenberg 1944, Marquardt 1963, Moré 1978 (scaling); Nielsen 1999 (damp
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import scipy.optimize
@@ -32,6 +33,9 @@ from raytrace.words import RaytraceError, RaytraceWarning
 _SHARED = 1e-5  # weight of the single sides of a row relative to their sum, which alone does not distinguish them
 _ROUNDS = 12  # in which inequalities that a step violates are added
 _SLACK = 1e-11  # of the scaled step: violation of a condition that is tolerated
+
+
+Arrays: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 class NoStep(RaytraceError, ValueError):
@@ -70,7 +74,18 @@ class Linear:
     lower, upper: (n,) of the step; limits (l,) ≤ 0 and their slope (l, n); scale: D (n,).
     """
 
-    def __init__(self, residuals, jacobian, *, sides: Sides, held, limits, lower, upper, scale):
+    def __init__(
+        self,
+        residuals: np.ndarray,
+        jacobian: np.ndarray,
+        *,
+        sides: Sides,
+        held: Arrays,
+        limits: Arrays,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        scale: np.ndarray,
+    ):
         self.scale = scale
         scaled = jacobian / scale
         if len(scaled) > len(scale):
@@ -135,7 +150,16 @@ class Linear:
             active, switched = active | broken, switched | crossed
         return y / self.scale
 
-    def _under(self, triangle, target, base, free, active, least, switched) -> np.ndarray:
+    def _under(
+        self,
+        triangle: np.ndarray,
+        target: np.ndarray,
+        base: np.ndarray,
+        free: np.ndarray,
+        active: np.ndarray,
+        least: np.ndarray,
+        switched: np.ndarray,
+    ) -> np.ndarray:
         """The minimum of the damped model under the active conditions and sides."""
         matrix, right = triangle @ free, target - triangle @ base
         conditions, bound = self.conditions[active] @ free, (least - self.conditions @ base)[active]
@@ -167,7 +191,7 @@ class Linear:
         return base + free @ end[:width]
 
 
-def _of_equalities(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _of_equalities(matrix: np.ndarray, right: np.ndarray) -> Arrays:
     """The shortest step that meets equalities as well as possible, and a basis (n, f) of their null space."""
     count = matrix.shape[1]
     if not len(matrix):
@@ -226,7 +250,7 @@ _UNLIMITED = 500  # cycles of a path without other limits: along a narrow valley
 class SumOfSquares:
     """A sum of squares and its conditions at x (n,): residuals (m,), sides, held (h,) = 0 and limits (l,) ≤ 0.
 
-    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, None unless requested.
+    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, empty unless requested.
     """
 
     x: np.ndarray
@@ -235,9 +259,9 @@ class SumOfSquares:
     sides: Sides
     held: np.ndarray
     limits: np.ndarray
-    jacobian: np.ndarray | None = None
-    held_slope: np.ndarray | None = None
-    limits_slope: np.ndarray | None = None
+    jacobian: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    held_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    limits_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def cost(self) -> float:
@@ -288,7 +312,7 @@ class CycleStart:
     factor: float
     share: float
     price: float
-    scale: np.ndarray | None
+    scale: np.ndarray
     evaluations: int
     cycles: tuple[Cycle, ...]
 
@@ -356,12 +380,24 @@ class _OutOfTime(Exception):
 
 
 class _LeastSquares:
-    def __init__(self, evaluate, lower, upper, typical, options: SolverOptions, until: float, watch):
+    state: SumOfSquares
+
+    def __init__(
+        self,
+        evaluate: Evaluate,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        typical: np.ndarray,
+        options: SolverOptions,
+        until: float,
+        watch: Callable[[Cycle, CycleStart], None] | None,
+    ):
         self.evaluate, self.lower, self.upper, self.options = evaluate, lower, upper, options
         self.typical, self.until, self.watch = typical, until, watch
-        self.evaluations, self.cycles, self.started = 0, [], time.monotonic()
+        self.evaluations, self.started = 0, time.monotonic()
+        self.cycles: list[Cycle] = []
         self.damping, self.share, self.price = options.damping, 1.0, 0.0
-        self.scale = None
+        self.scale = np.zeros(len(lower))
         self.factor = 2.0
         self.seconds = {False: 0.0, True: 0.0}  # of the last evaluation without and with derivatives
 
@@ -403,15 +439,14 @@ class _LeastSquares:
         if self._is_flat(linear):
             return "gradient"
         for _ in range(_TRIES):
-            trial, step, predicted = self._try(linear)
-            if (
-                step is not None
-                and self.damping < 1
-                and predicted <= _ROUNDING * self.state.cost
-                and not (self.state.missed > 1e-9).any()
-            ):
+            is_missed = bool((self.state.missed > 1e-9).any())
+            if (tried := self._try(linear)) is None:
+                self._raise_damping(True)
+                continue
+            trial, step, predicted = tried
+            if self.damping < 1 and predicted <= _ROUNDING * self.state.cost and not is_missed:
                 return "gradient"
-            if trial is not None and self._accepts(trial, predicted):
+            if self._accepts(trial, predicted):
                 try:
                     self.state = self.at(trial.x, True)
                 except _OutOfTime:
@@ -420,14 +455,14 @@ class _LeastSquares:
                     return "seconds"
                 self._report(number, step)
                 return self._idle()
-            self.damping, self.factor = self.damping * self.factor, 2 * self.factor
-            if step is None or (self.state.missed > 1e-9).any():
-                self.share *= 0.5
-            if step is None:
-                continue
+            self._raise_damping(is_missed)
             if np.linalg.norm(self.scale * step) <= _STILL * (np.linalg.norm(self.scale * self.state.x) + 1e-300):
                 return "step"
         return "step"
+
+    def _raise_damping(self, halves_share: bool) -> None:
+        self.damping, self.factor = self.damping * self.factor, 2 * self.factor
+        self.share *= 0.5 if halves_share else 1.0
 
     def _linear(self) -> Linear:
         state = self.state
@@ -435,19 +470,19 @@ class _LeastSquares:
         floor = self.options.floor * np.sqrt(self.state.cost) / self.typical
         columns = np.sqrt(columns**2 + floor**2)
         columns = np.where(columns > 0, columns, 1.0)
-        self.scale = np.maximum(columns, self.scale) if self.options.keeps and self.scale is not None else columns
+        self.scale = np.maximum(columns, self.scale) if self.options.keeps else columns
         return Linear(
             state.residuals, state.jacobian, sides=state.sides, held=(state.held, state.held_slope),
             limits=(state.limits, state.limits_slope), lower=self.lower - state.x, upper=self.upper - state.x,
             scale=self.scale,
         )  # fmt: skip
 
-    def _try(self, linear: Linear):
+    def _try(self, linear: Linear) -> tuple[SumOfSquares, np.ndarray, float] | None:
         """The state of a trial step, the step, and the predicted reduction; None where there is no step."""
         try:
             step = linear.step(self.damping, self.share)
         except NoStep:
-            return None, None, 0.0
+            return None
         bent = self._bent(linear, step) if self.options.bends else step
         trial = self.at(np.clip(self.state.x + bent, self.lower, self.upper))
         if len(self.state.held) and trial.is_finite:
@@ -553,7 +588,7 @@ class PathProgress:
 
     path: int
     start: np.ndarray
-    solver: CycleStart | None
+    solver: CycleStart
     before: tuple[Cycle, ...] = ()
     evaluations: int = 0
     best: tuple[np.ndarray, str] | None = None
@@ -561,15 +596,19 @@ class PathProgress:
     @property
     def history(self) -> tuple[Cycle, ...]:
         """The cycles of all paths."""
-        return (*self.before, *self.counted(self.solver.cycles))
+        return (*self.before, *_counted(self.solver.cycles, len(self.before), self.evaluations))
 
-    def counted(self, cycles: Sequence[Cycle]) -> list[Cycle]:
-        """Cycles of this path by their number in all paths."""
-        number, evaluations = len(self.before), self.evaluations
-        return [
-            dataclasses.replace(cycle, number=cycle.number + number, evaluations=cycle.evaluations + evaluations)
-            for cycle in cycles
-        ]
+
+def _counted(cycles: Sequence[Cycle], before: int, evaluations: int) -> list[Cycle]:
+    """Cycles of a path by their number in all paths; before, evaluations: cycles and evaluations of earlier paths."""
+    return [
+        dataclasses.replace(cycle, number=cycle.number + before, evaluations=cycle.evaluations + evaluations)
+        for cycle in cycles
+    ]
+
+
+#: Cycles, evaluations and the best end of earlier paths, as of `PathProgress`.
+_Earlier: TypeAlias = tuple[tuple[Cycle, ...], int, tuple[np.ndarray, str] | None]
 
 
 def best_of_paths(
@@ -592,28 +631,37 @@ def best_of_paths(
     """
     until = time.monotonic() + (np.inf if seconds is None else seconds)
     most = cycles if cycles is not None else _UNLIMITED * max(1, paths) if seconds is None else 1_000_000
-    first = PathProgress(0, x, None) if resume is None else resume
-    x, best, stopped = first.start, None, ""
-    if first.best is not None:
-        best, stopped = evaluate(first.best[0], False), first.best[1]
-    history, evaluations = first.before, first.evaluations
-    for path in range(first.path, min(len(PATHS), max(1, paths))):
-        current = PathProgress(path, x, first.solver, history, evaluations, None if best is None else (best.x, stopped))
+    first, evaluations = 0, 0
+    solver: CycleStart | None = None
+    history: tuple[Cycle, ...] = ()
+    best: SumOfSquares | None = None
+    stopped = ""
+    if resume is not None:
+        first, x, solver, history, evaluations = (
+            resume.path, resume.start, resume.solver, resume.before, resume.evaluations,
+        )  # fmt: skip
+        if resume.best is not None:
+            best, stopped = evaluate(resume.best[0], False), resume.best[1]
+    for path in range(first, min(len(PATHS), max(1, paths))):
+        earlier = history, evaluations, None if best is None else (best.x, stopped)
 
-        def each(cycle: Cycle, solver: CycleStart, current=current) -> None:
-            watch(*current.counted([cycle]), dataclasses.replace(current, solver=solver))
+        def each(cycle: Cycle, solver: CycleStart, path: int = path, earlier: _Earlier = earlier) -> None:
+            if watch is not None:
+                progress = PathProgress(path, x, solver, *earlier)
+                watch(_counted([cycle], len(progress.before), progress.evaluations)[0], progress)
 
         descent = least_squares(
             evaluate, x, lower=lower, upper=upper, typical=typical, options=PATHS[path], cycles=most - len(history),
-            until=until, watch=watch and each, resume=first.solver if path == first.path else None,
+            until=until, watch=each, resume=solver if path == first else None,
         )  # fmt: skip
-        history = (*history, *current.counted(descent.cycles))
+        history = (*history, *_counted(descent.cycles, len(history), evaluations))
         evaluations += descent.evaluations
         if best is None or descent.state.is_better(best):
             best, stopped = descent.state, descent.stopped
         if descent.stopped in ("interrupted", "seconds") or len(history) >= most or time.monotonic() > until:
             stopped = descent.stopped if descent.stopped in ("interrupted", "cycles", "seconds") else stopped
             break
+    assert best is not None  # there is a path
     return BestDescent(best, history, stopped, len(history), evaluations)
 
 
@@ -627,11 +675,29 @@ class NoOptimum(RaytraceWarning):
     """A search ended where the error still falls; its last point is used."""
 
 
-def _lbfgsb(function, x, scale, bounds, **options):
-    """scipy's L-BFGS-B on y = x / scale. function: x -> (value, gradient); bounds: (n, 2) of x, or None."""
-    callback = options.pop("callback", None)
+Slope: TypeAlias = tuple[float, np.ndarray]  # a value and its gradient
 
-    def scaled(y: np.ndarray) -> tuple[float, np.ndarray]:
+
+class Function(Protocol):
+    """A function of variables (n,): its value and its gradient (n,); evaluations: how often it was called."""
+
+    evaluations: int
+
+    def __call__(self, x: np.ndarray, /) -> Slope: ...
+
+
+def _lbfgsb(
+    function: Callable[[np.ndarray], Slope],
+    x: np.ndarray,
+    scale: np.ndarray | float,
+    bounds: np.ndarray | None,
+    *,
+    callback: Callable[[np.ndarray], None] | None = None,
+    **options: float,
+) -> Any:
+    """scipy's L-BFGS-B on y = x / scale. function: x -> (value, gradient); bounds: (n, 2) of x, or None."""
+
+    def scaled(y: np.ndarray) -> Slope:
         value, gradient = function(y * scale)
         return value, gradient * scale
 
@@ -643,7 +709,7 @@ def _lbfgsb(function, x, scale, bounds, **options):
 
 
 def minimise(
-    merit: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    merit: Function,
     x: np.ndarray,
     *,
     lower: np.ndarray,
@@ -655,30 +721,32 @@ def minimise(
 ) -> tuple[np.ndarray, str, list[Cycle]]:
     """Variables at a minimum of a merit that is not a sum of squares, why the descent ended, and its cycles.
 
-    merit: x -> value and gradient, with a count `evaluations`; typical: as for `least_squares`.
+    typical: as for `least_squares`.
     """
-    started, reports = time.monotonic(), []
+    started = time.monotonic()
+    reports: list[Cycle] = []
     scale = np.where(np.isfinite(typical), typical, np.maximum(np.abs(x), 1e-3))
     start = merit(x)[0]
-    best, last = [start, x], [0.0]  # last: s of an evaluation
+    least, best, last = start, x, 0.0  # last: s of an evaluation
 
-    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost(x: np.ndarray) -> Slope:
+        nonlocal least, best, last
         evaluated = time.monotonic()
-        if seconds is not None and evaluated + last[0] > started + seconds:
+        if seconds is not None and evaluated + last > started + seconds:
             raise _OutOfTime
         value, gradient = merit(x)
-        last[0] = time.monotonic() - evaluated
+        last = time.monotonic() - evaluated
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return _FAR * max(abs(start), 1.0), np.zeros_like(x)
-        if value < best[0]:
-            best[:] = value, x
+        if value < least:
+            least, best = value, x
         return value, gradient
 
     def each(y: np.ndarray) -> None:
         elapsed = time.monotonic() - started
-        reports.append(Cycle(len(reports) + 1, best[0], 0.0, 0.0, 0.0, merit.evaluations, elapsed))
+        reports.append(Cycle(len(reports) + 1, least, 0.0, 0.0, 0.0, merit.evaluations, elapsed))
         if watch is not None:
-            watch(reports[-1], best[1])
+            watch(reports[-1], best)
         if seconds is not None and elapsed > seconds:
             raise _OutOfTime
 
@@ -692,7 +760,7 @@ def minimise(
         stopped = "seconds"
     except KeyboardInterrupt:
         stopped = "interrupted"
-    return best[1], stopped, reports
+    return best, stopped, reports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -719,7 +787,9 @@ def minimise_tensors(
     unit: of the parameters, length of the first step; bounds: (lowest, highest) of each number; tolerance: relative
     change of the function below which it ends.
     """
-    shapes, values, gradients = [p.shape for p in parameters], [], []
+    shapes = [p.shape for p in parameters]
+    values: list[float] = []
+    gradients: list[np.ndarray] = []
     ends = np.cumsum([shape.numel() for shape in shapes])[:-1]
 
     def put(x: np.ndarray) -> None:
@@ -730,7 +800,7 @@ def minimise_tensors(
     def flat(tensors: Sequence[Tensor]) -> np.ndarray:
         return torch.cat([t.detach().flatten() for t in tensors]).double().numpy()
 
-    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(x: np.ndarray) -> Slope:
         put(x)
         value = function()
         values.append(float(value.detach()))

@@ -5,6 +5,7 @@ each lens with exact derivatives by these.
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ class _Square(torch.autograd.Function):
     """M² = Σ r² of lenses with variables x (L, n), ∂M²/∂x = 2 rᵀ ∂r/∂x."""
 
     @staticmethod
-    def forward(context, x: Tensor, evaluation: Evaluation, by: tuple[int, ...]) -> Tensor:
+    def forward(context: Any, x: Tensor, evaluation: Evaluation, by: tuple[int, ...]) -> Tensor:
         needed = context.needs_input_grad[0]
         each = [evaluation(row, derivatives=needed, shown=False, by=by) for row in x.numpy()]
         if needed:
@@ -63,7 +64,7 @@ class _Square(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(context, slope: Tensor) -> tuple[Tensor, None, None]:
+    def backward(context: Any, slope: Tensor) -> tuple[Tensor, None, None]:
         return slope[:, None] * context.saved_tensors[0], None, None
 
 
@@ -81,7 +82,8 @@ def _differing(lens: Lens, first: Lens) -> Iterator[tuple[Address, Tensor]]:
         for n in range(single.glass.coefficients.numel()):
             paths[f"{GLASS_NUMBER}{n + 1}"] = ParameterPath(("glass", "coefficients"), n)
         for quantity, (steps, entry) in paths.items():
-            part, of_first = surface, single
+            part: Any = surface
+            of_first: Any = single
             for name in steps:
                 part, of_first = getattr(part, name), getattr(of_first, name)
             if part is not None and _moves(part, of_first):

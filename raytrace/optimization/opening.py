@@ -40,7 +40,7 @@ def opened(
     upper: np.ndarray,
     typical: np.ndarray | None = None,
     until: float = np.inf,
-    watch: Callable[[Cycle, np.ndarray], None] | None = None,
+    watch: Callable[[Cycle, np.ndarray], object] | None = None,
 ) -> Opened:
     """Variables at which fewer rays fail than at x; x itself where nearly none do, or no such variables are found.
 
@@ -63,6 +63,8 @@ def opened(
 
     def each(cycle: Cycle, solver: CycleStart) -> None:
         nonlocal shown
+        if watch is None:
+            return
         whole = problem.state(solver.x, False)
         shown = whole if whole.is_finite and whole.is_better(shown) else shown
         cycle = dataclasses.replace(cycle, number=count + cycle.number, merit=float(np.sqrt(shown.cost)))
@@ -74,7 +76,7 @@ def opened(
         try:
             with np.errstate(all="ignore"):
                 descent = least_squares(
-                    stage.state, x, options=_DAMPED, cycles=_CYCLES, until=until, watch=watch and each, **bounds
+                    stage.state, x, options=_DAMPED, cycles=_CYCLES, until=until, watch=each, **bounds
                 )
         except np.linalg.LinAlgError:  # numbers overflow
             continue

@@ -6,7 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from raytrace.optimization.attained import NotReached, attained
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
-from raytrace.optimization.least_squares import BestDescent, Cycle, PathProgress, best_of_paths, minimise
+from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths, minimise
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, merit_for
 from raytrace.optimization.opening import Opened, opened
 from raytrace.optimization.optimized import AsBuiltChange, Optimized
@@ -43,6 +43,8 @@ from raytrace.words import calling_level
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
+
+Numbers: TypeAlias = np.ndarray | Sequence[float]
 
 
 def optimize(
@@ -89,7 +91,7 @@ def optimize(
         if path is not None:
             check_output(path, suffixes)
     for option, path in (("checkpoint", checkpoint), ("resume", resume)):
-        if None not in (log, path) and os.path.realpath(log) == os.path.realpath(path):
+        if log is not None and path is not None and os.path.realpath(log) == os.path.realpath(path):
             raise ValueError(f"{log}: `log` and `{option}` are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
     model, glasses = without_glass(design_variables(lens, vary), vary)
@@ -100,7 +102,7 @@ def optimize(
     for name, least, most in zip(names, lower, upper, strict=True):
         if not least <= most:
             raise NoProblem(f"`bounds` of {name}: from {least:g} to {most:g} there is nothing")
-    settings = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles}
+    typical = typical_of(model)
     is_stored = checkpoint is not None or resume is not None
 
     def about(**of_merit: object) -> dict[str, object]:
@@ -113,11 +115,13 @@ def optimize(
         return Stored(model.start, {}) if resume is None else read_checkpoint(resume, about, names)
 
     def observer(
-        about: Mapping[str, object], watch: Callable | None, descent: PathProgress | None = None
+        about: Mapping[str, object], lens_at: Callable[[np.ndarray], Lens], descent: PathProgress | None = None
     ) -> "_Observer":
         file = None if checkpoint is None else Checkpoint(checkpoint, about, names)
-        return _Observer(log, file, progress and progress(cycles, "cycle"), descent, watch)
+        shown = None if watch is None else lambda cycle, x: watch(cycle, lens_at(x))
+        return _Observer(log, file, progress and progress(cycles, "cycle"), descent, shown)
 
+    dependencies: dict[str, object] = {}
     if callable(merit):
         if glasses:
             raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
@@ -125,87 +129,92 @@ def optimize(
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
         if as_built is not None:
             raise NoProblem("`as_built` goes with a merit of rows: add `as_built.of(lens).expected` to the function")
-        dependencies = about(merit=getattr(merit, "__qualname__", type(merit).__name__)) if is_stored else {}
+        if is_stored:
+            dependencies = about(merit=getattr(merit, "__qualname__", type(merit).__name__))
         function = FunctionMerit(model, merit, stored(dependencies).evaluated)
         start = np.clip(model.start, lower, upper)
-        with observer(dependencies, watch and (lambda cycle, x: watch(cycle, _lens_at(model, x)))) as seen:
-            before = function(model.start)[0]
-            if not np.isfinite(before):
-                raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
+        with observer(dependencies, lambda x: _lens_at(model, x)) as seen:
+            merit_before = function(model.start)[0]
+            if not np.isfinite(merit_before):
+                raise NoProblem(f"the merit is {merit_before:g} at the start: nothing to follow")
 
             def each(cycle: Cycle, x: np.ndarray) -> None:
                 seen.after_cycle(cycle, x, evaluated=function.evaluated)
 
-            left = None if np.isinf(until) else until - time.monotonic()
-            x, stopped, history = minimise(function, start, watch=each, seconds=left, **settings)
-            after = function(x)[0]
-            seen.write(x, after, len(history), evaluated=function.evaluated, now=True)
-        descent = BestDescent(x, tuple(history), stopped, len(history), function.evaluations)
-        result = _lens_at(model, x)
-        return _warned(_optimized(lens, result, model, names, x, descent, started, merits=(before, after)))
+            x, stopped, history = minimise(
+                function, start, lower=lower, upper=upper, typical=typical, cycles=cycles, watch=each,
+                seconds=None if seconds is None else until - time.monotonic(),
+            )  # fmt: skip
+            merit_after = function(x)[0]
+            seen.write(x, merit_after, len(history), evaluated=function.evaluated, now=True)
+        result = _optimized(
+            lens, _lens_at(model, x), model, x, history, merits=(merit_before, merit_after), cycles=len(history),
+            evaluations=function.evaluations, stopped=stopped, seconds=time.monotonic() - started,
+        )  # fmt: skip
+        return _warned(result)
     rows = merit_for(lens, merit)
     conditions, of_rows = conditions_in_unit(lens, hold, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, rows.rows, conditions, as_built=term, **of_rows)
-    dependencies = {}
     if is_stored:
         dependencies = about(merit=digest([repr(row) for row in rows.rows], of_rows), hold=digest(repr(conditions)))
         dependencies |= {} if term is None else {"as built": digest(term.about())}
     resumed = stored(dependencies)
     if set(resumed.glasses) - set(glasses):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
-    start, choice, opening = np.clip(resumed.x, lower, upper), None, Opened(resumed.x)
+    start, opening = np.clip(resumed.x, lower, upper), Opened(resumed.x)
+    choice: Choice | None = None
     ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
     bounded = {name: pair for name, pair in ends.items() if not np.isinf(pair).all()}
 
     def lens_at(x: np.ndarray) -> Lens:
         return _lens_at(problem.model, x, rows=problem.rows, unit=problem.unit, bounded=bounded)
 
-    watch_lens = watch and (lambda cycle, x: watch(cycle, lens_at(x)))
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
     seconds_of_end = time.monotonic() - evaluating
     if not resumed.glasses and resumed.descent is None:
-        limits = {"lower": lower, "upper": upper, "typical": settings["typical"], "until": until}
-        opening = opened(problem, start, watch=watch_lens, **limits)
+        opening = opened(
+            problem, start, lower=lower, upper=upper, typical=typical, until=until,
+            watch=None if watch is None else lambda cycle, x: watch(cycle, lens_at(x)),
+        )  # fmt: skip
         start = opening.x
-        settings |= {"cycles": 0} if opening.interrupted else {}
         evaluating = time.monotonic()
         _refuse_undefined(problem, problem.evaluated(start, True))
         seconds_of_end = min(seconds_of_end, time.monotonic() - evaluating)  # the first evaluation takes longer
     until -= seconds_of_end  # the result is evaluated once more
-    with observer(dependencies, watch_lens, resumed.descent) as seen:
+    with observer(dependencies, lens_at, resumed.descent) as seen:
         if glasses and not opening.interrupted:
-            pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
-            keep = seen.checkpoint and seen.checkpoint.write_glasses
-            of_choice = {"cycles": cycles, "until": until, "keep": keep, "as_built": term, **of_rows}
-            choice = Choice(model, glasses, pool, rows.rows, conditions, limits, **of_choice)
+            pool = pool_of(lens, catalogs_of(lens, catalog))
+            keep = None if seen.checkpoint is None else seen.checkpoint.write_glasses
+            choice = Choice(
+                model, glasses, pool, rows.rows, conditions, (lower, upper), cycles=cycles, until=until, keep=keep,
+                as_built=term, **of_rows,
+            )  # fmt: skip
             start, problem = choice.run(start, resumed).x, choice.problem(choice.best.glasses, ())
-        settings["seconds"] = None if seconds is None else until - time.monotonic()
         descent = best_of_paths(
-            problem.state, start, paths=paths, watch=seen.after_cycle_of_paths, resume=resumed.descent, **settings
-        )
+            problem.state, start, lower=lower, upper=upper, typical=typical, paths=paths,
+            cycles=0 if opening.interrupted else cycles, seconds=None if seconds is None else until - time.monotonic(),
+            watch=seen.after_cycle_of_paths, resume=resumed.descent,
+        )  # fmt: skip
         merit_of_rows, count = float(np.sqrt(descent.state.cost)), len(descent.history)
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
     x, count = descent.state.x, len(problem.rows)
-    descent = dataclasses.replace(
-        descent,
-        stopped="interrupted" if opening.interrupted else descent.stopped,
-        cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
-        evaluations=descent.evaluations + (choice.evaluations if choice else 0),
-    )
     after = problem.evaluated(x)
     results = attained(problem, after)
     if not all(result.met for result in results):
         results = with_reasons(results, problem, x, lower=lower, upper=upper)
     end = lens_at(x)
     result = _optimized(
-        lens, end, problem.model, names, x, descent, started, rows=problem.rows,
+        lens, end, problem.model, x, descent.history, rows=problem.rows,
         merits=(problem.merit(before, model.start), problem.merit(after, x)),
         values=(before.values[:count], after.values[:count]),
-        contributions=tuple(end.contributions(np.arange(count)) for end in (before, after)),
+        contributions=(before.contributions(np.arange(count)), after.contributions(np.arange(count))),
+        cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
+        evaluations=descent.evaluations + (choice.evaluations if choice else 0),
+        stopped="interrupted" if opening.interrupted else descent.stopped, seconds=time.monotonic() - started,
         glasses=tuple(choice.steps) if choice else (), conditions=results,
         as_built=None if term is None else AsBuiltChange.of(term, lens, end),
     )  # fmt: skip
@@ -267,11 +276,11 @@ def _refuse_undefined(problem: Problem, start: Evaluated) -> None:
         row, number = problem.evaluation.rows[k], start.values[k]
         raise NoProblem(f"row {k + 1} of the merit function, {row.name}, is {number:g} at the start")
     if not np.isfinite(start.jacobian).all():
-        k, variable = np.argwhere(~np.isfinite(start.jacobian))[0]
-        row, name = int(start.of_row[k]), name_of(problem.model.variables[variable])
+        place, variable = np.argwhere(~np.isfinite(start.jacobian))[0]
+        k, name = int(start.of_row[place]), name_of(problem.model.variables[variable])
         raise NoProblem(
-            f"row {row + 1} of the merit function, {problem.evaluation.rows[row].name}, has no derivative by {name} at "
-            f"the start: {start.jacobian[k, variable]:g}"
+            f"row {k + 1} of the merit function, {problem.evaluation.rows[k].name}, has no derivative by {name} at "
+            f"the start: {start.jacobian[place, variable]:g}"
         )
     if start.lost[np.unique(start.of_row)].all():
         raise NoProblem("no row of the merit function has a value: no ray of them gets through the lens as it is")
@@ -301,39 +310,35 @@ def _optimized(
     lens: Lens,
     after: Lens,
     model: DesignVariables,
-    names: tuple[str, ...],
     x: np.ndarray,
-    descent: BestDescent,
-    started: float,
+    history: Sequence[Cycle],
     *,
     merits: tuple[float, float],
     rows: tuple[Row, ...] = (),
-    values: tuple = ((), ()),
-    contributions: tuple = ((), ()),
-    **more,
+    values: tuple[Numbers, Numbers] = ((), ()),
+    contributions: tuple[Numbers, Numbers] = ((), ()),
+    **more: Any,
 ) -> Optimized:
-    def tensor(numbers) -> torch.Tensor:
+    """The result; values, contributions: of the rows before and after; more: further fields."""
+
+    def tensor(numbers: Numbers) -> torch.Tensor:
         return torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)
 
-    history = [[c.merit, c.missed, c.step, c.damping, c.seconds] for c in descent.history]
+    cycles = [[cycle.merit, cycle.missed, cycle.step, cycle.damping, cycle.seconds] for cycle in history]
     return Optimized(
         lens=after,
         before=lens,
         merit=rows,
-        names=names,
+        names=tuple(map(name_of, model.variables)),
         variables_before=tensor(model.start),
         variables_after=tensor(x),
         values_before=tensor(values[0]),
         values_after=tensor(values[1]),
         contributions_before=tensor(contributions[0]),
         contributions=tensor(contributions[1]),
-        history=tensor(history).reshape(-1, 5),
+        history=tensor(np.reshape(cycles, (-1, 5))),
         merit_before=merits[0],
         merit_after=merits[1],
-        cycles=descent.cycles,
-        evaluations=descent.evaluations,
-        seconds=time.monotonic() - started,
-        stopped=descent.stopped,
         **more,
     )
 

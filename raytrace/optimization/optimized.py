@@ -11,7 +11,7 @@ from torch import Tensor
 
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Result, Table, number, plain, text_table
+from raytrace.maths.result import Column, Columns, Result, Table, number, plain, text_table
 from raytrace.optimization.attained import Attained
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.glass_choice import GlassStep
@@ -31,7 +31,7 @@ _UNSHARP = 0.1  # MTF, of a start from which an MTF merit function is far from i
 
 
 def _glass_table(steps: Sequence[GlassStep]) -> Table:
-    columns = {
+    columns: Columns = {
         Column("glass", form="<"): [step.words for step in steps],
         Column("predicted"): [step.predicted if step.surface else "" for step in steps],
         Column("merit"): [step.reached for step in steps],
@@ -95,7 +95,7 @@ class Optimized(Result):
     conditions: tuple[Attained, ...] = ()
     as_built: AsBuiltChange | None = None
 
-    def draw(self) -> "Figure":
+    def draw(self, **options: Any) -> "Figure":
         """One page: lens, spots and merit function before and after."""
         from raytrace.optimization.optimized_figure import optimize_report
 
@@ -178,7 +178,7 @@ class Optimized(Result):
             *self._unsharp_start(),
             "",
         ]
-        variables = {
+        variables: Columns = {
             Column("variable", form="<"): self.names,
             Column("before", form=".8g"): self.variables_before,
             Column("after", form=".8g"): self.variables_after,
@@ -220,7 +220,7 @@ class Optimized(Result):
             Column(name, form=".6g"): ["lost" if np.isnan(value) else value for value in values[places].tolist()]
             for name, values in (("before", self.values_before), ("after", self.values_after))
         }
-        columns = {
+        columns: Columns = {
             **({Column("conf."): [self.configurations[k] for k in places]} if self.has_configurations else {}),
             Column("row"): left[:_SHOWN],
             Column("operand", form="<"): [row.name for row in shown],

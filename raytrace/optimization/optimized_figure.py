@@ -102,19 +102,19 @@ def _draw_spots(page: "SubFigure", drawn: list[tuple[str, Lens, Lens]]) -> None:
     rows = []
     for label, *both in drawn:
         spots = [field_spots(lens, fields=drawn_fields(lens)) for lens in both]
-        half = panel_size(np.concatenate([style.array(whole.geometric_radius) for whole, _ in spots]), airy)
+        half = panel_size(np.concatenate([style.array(whole.geometric_radius) for whole, _ in spots]).tolist(), airy)
         rows += [(label, *row, half) for row in zip(both, spots, ("before", "after"), strict=True)]
     for row, (label, lens, (whole, dots), when, half) in zip(panels, rows, strict=True):
         fields = drawn_fields(lens)
-        look = {"wavelengths": style.array(lens.wavelengths), "airy": float(airy_radius(lens)), "half": half}
+        waves, radius = style.array(lens.wavelengths), float(airy_radius(lens))
         for f, panel in enumerate(row):
             if f >= fields.shape[1]:
                 panel.axis("off")
                 continue
-            draw_spot_to_scale(panel, whole, dots, f, **look)
+            draw_spot_to_scale(panel, whole, dots, f, wavelengths=waves, airy=radius, half=half)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
-                panel.set_title(field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
+                panel.set_title(field_label(lens, fields[:, f].tolist()), color=colour, fontsize=8.5)
         row[0].set_ylabel(f"Spots {when}" + (f"\n{label}" if label else ""), fontweight="bold")
     page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
 

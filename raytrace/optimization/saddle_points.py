@@ -18,7 +18,7 @@ Opt. Express 17, 2009.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import null_space
@@ -91,8 +91,8 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
     made, free = with_meniscus(lens, k), task.model
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
-    old = [_moved(variable, k) for variable in free.variables]
-    bounds = {variable: ends for variable, *ends in zip(old, *task.bounds, strict=True)}
+    old = [replace(variable, surface=_behind(variable.surface, k)) for variable in free.variables]
+    bounds = {variable: (least, most) for variable, least, most in zip(old, *task.bounds, strict=True)}
     steep = bounds[next(variable for variable in old if variable.address == (k + 2, "curvature"))]
     bounds |= {variable: steep if variable.quantity == "curvature" else (-np.inf, np.inf) for variable in new}
     quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *old)))
@@ -108,7 +108,10 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
         model=DesignVariables(made, variables, solves),
         rows=tuple(_row(row, k) for row in task.rows),
         conditions=tuple(replace(condition, row=_row(condition.row, k)) for condition in task.conditions),
-        bounds=tuple(np.array([bounds[variable][side] for variable in variables], dtype=float) for side in range(2)),
+        bounds=(
+            np.array([bounds[variable][0] for variable in variables], dtype=float),
+            np.array([bounds[variable][1] for variable in variables], dtype=float),
+        ),
     )
 
 
@@ -122,9 +125,9 @@ def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
 def with_meniscus(lens: Lens, k: int) -> Lens:
     """The lens with a meniscus without thickness before surface k, of the adjacent glass; no ray changes."""
     surface = lens.surfaces[k]
-    common = {"thickness": 0 * surface.thickness, "apertures": (), "comment": ""}
+    thin = replace(surface, thickness=0 * surface.thickness, apertures=(), comment="")
     media = (surface, lens.surfaces[k - 1])  # behind the two new surfaces
-    new = [replace(surface, glass=medium.glass, environment=medium.environment, **common) for medium in media]
+    new = [replace(thin, glass=medium.glass, environment=medium.environment) for medium in media]
     stop = lens.stop + 2 if lens.stop >= k else lens.stop
     return replace(lens, surfaces=(*lens.surfaces[:k], *new, *lens.surfaces[k:]), stop=stop)
 
@@ -134,9 +137,8 @@ def _behind(surface: int, k: int) -> int:
     return surface + 2 if surface >= k else surface
 
 
-def _moved(moved: Vary | Solve, k: int) -> Vary | Solve:
-    further = {"source": _behind(moved.source, k)} if isinstance(moved, Solve) else {}
-    return replace(moved, surface=_behind(moved.surface, k), **further)
+def _moved(solve: Solve, k: int) -> Solve:
+    return replace(solve, surface=_behind(solve.surface, k), source=_behind(solve.source, k))
 
 
 def _row(row: Row, k: int) -> Row:
@@ -145,8 +147,8 @@ def _row(row: Row, k: int) -> Row:
         kinds = ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
     else:
         kinds = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    moved = [_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True)]
-    return replace(row, integers=tuple(moved)) if any(kinds) else row
+    first, second = (_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True))
+    return replace(row, integers=(first, second)) if any(kinds) else row
 
 
 def _split(row: Row, k: int, part: float) -> list[Row]:
@@ -322,7 +324,7 @@ class Insertion:
             if bar is not None:
                 bar.close()
 
-    def _both(self, place: Place, work: float, bar) -> float:
+    def _both(self, place: Place, work: float, bar: Any) -> float:
         """The two sides of a saddle; the seconds that they took."""
         tasks = [
             (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -62,6 +62,10 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Why a search ends.
 STOPPED = {
@@ -153,7 +157,7 @@ class Searched(Result):
         return [Table(shown, title)]
 
     @style.styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """The best lenses on one scale, each with its merit, its spots and how many descents reached it."""
         count = min(_MOST, len(self.lenses))
         columns = min(_COLUMNS, count)
@@ -233,7 +237,7 @@ def searched(
         stopped=stopped,
         seconds=seconds,
         as_built=tensor(terms) if terms else None,
-        tolerances=as_built.words() if terms else "",
+        tolerances=as_built.words() if as_built is not None and terms else "",
     )
 
 
@@ -286,7 +290,7 @@ def _spots(lens: Lens) -> Tensor:
     return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
 
 
-def _draw(axes, result: Searched, k: int) -> None:
+def _draw(axes: "Axes", result: Searched, k: int) -> None:
     _draw_lens(axes, result.lenses[k])
     spots = ", ".join(f"{1e3 * float(radius):.1f}" for radius in result.spots[k])
     times = int(result.times_reached[k])
@@ -296,7 +300,7 @@ def _draw(axes, result: Searched, k: int) -> None:
     )  # fmt: skip
 
 
-def _draw_lens(axes, lens: Lens) -> None:
+def _draw_lens(axes: "Axes", lens: Lens) -> None:
     lens = detached(lens)
     draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
 
@@ -371,7 +375,7 @@ def search(
     ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
     task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
     until = started + (np.inf if seconds is None else seconds)
-    surfaces = ()
+    surfaces: tuple[int, ...] = ()
     if insert is not None and insert is not False:
         if starts is not None:
             raise NoProblem(
@@ -420,7 +424,7 @@ class _Run:
 
     DONE: ClassVar[str] = "starts"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         pupil, field = _NARROW  # the rays of default merit functions nearer to the axis
         scale = np.array([field, field, pupil, pupil])
         rows = [
@@ -446,7 +450,7 @@ class _Run:
             if bar is not None:
                 bar.close()
 
-    def _batch(self, numbers: range, bar) -> None:
+    def _batch(self, numbers: range, bar: Any) -> None:
         def start(number: int) -> TaskResult:
             result = self._start(number)
             if bar is not None:
@@ -462,12 +466,12 @@ class _Run:
         hops = [(f"hop {numbers[0] + k}", springs[k % len(springs)].result.x) for k in range(_HOPS)] if springs else []
         self._follow([(key, self._hopped(key, x)) for key, x in hops], bar)
 
-    def _results(self, tasks) -> list[TaskResult]:
+    def _results(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]]) -> list[TaskResult]:
         ends = self.journal.each(tasks, len(self.space.lower))
         self.work += sum(end.seconds for end in ends)
         return ends
 
-    def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
+    def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar: Any) -> None:
         stages = [Stage(self.whole, LONG, FOLLOW, *self.bounds)]
         ends = self._results([(key, lambda x=x: descended(x, stages, self.journal.until)) for key, x in tasks])
         self.followed += len(tasks)
@@ -479,16 +483,17 @@ class _Run:
         """The lens as it is, or the best of some points between the bounds; both descended a little."""
         start = self.task.model.start
         points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(start, *self.bounds)[None]
-        best, worth = None, (np.inf, np.inf)  # failed rays and squares on the narrow beam
-        for x in map(self.space.prepared, points):
+
+        def rank(x: np.ndarray) -> tuple[float, float]:
+            """Failed rays and sum of squares on the narrow beam."""
             with np.errstate(all="ignore"):
                 evaluated = self.narrow.evaluated(x)
-            rank = float(evaluated.lost.sum()), float(np.nansum(evaluated.residuals**2))
-            if best is None or rank < worth:
-                best, worth = x, rank
-        if worth[0]:
-            bounds = {"lower": self.space.lower, "upper": self.space.upper}
-            best, _, interrupted = opened(self.whole, best, until=self.journal.until, **bounds)
+            return float(evaluated.lost.sum()), float(np.nansum(evaluated.residuals**2))
+
+        (lost, _), best = min(((rank(x), x) for x in map(self.space.prepared, points)), key=lambda pair: pair[0])
+        if lost:
+            lower, upper = self.space.lower, self.space.upper
+            best, _, interrupted = opened(self.whole, best, lower=lower, upper=upper, until=self.journal.until)
             if interrupted or time.monotonic() > self.journal.until:
                 raise SearchStopped
         stages = [

@@ -24,6 +24,7 @@ from scipy.stats import qmc
 
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.merit import RowOptions
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, name_of
 from raytrace.shards import agreeing, share, total
@@ -87,11 +88,13 @@ class Journal:
 
         Raises BadSearch.
         """
-        self.until, self.known, self.lines = until, {}, {}
+        self.until = until
+        self.known: dict[str, TaskResult] = {}
+        self.lines: dict[str, int] = {}
         self.store = Records(None if folder is None else Path(folder) / FILE, about, _JOURNAL, _TASK)
         for line, result in self.store.read():
-            numbers = (result[name] for name in TaskResult._fields[:4])
-            self.known[result["task"]] = TaskResult(*numbers, np.array(result["x"]))
+            numbers = {name: result[name] for name in TaskResult._fields[:4]}
+            self.known[result["task"]] = TaskResult(**numbers, x=np.array(result["x"]))
             self.lines[result["task"]] = line
 
     def each(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]], count: int) -> list[TaskResult]:
@@ -122,7 +125,8 @@ class Journal:
         if mine.processes > 1:
             for (key, _), row in zip(left, total(table), strict=True):
                 if row[0]:
-                    self._add(key, TaskResult(*row[1:5].tolist(), row[5:].numpy()))
+                    lost, missed, merit, seconds = row[1:5].tolist()
+                    self._add(key, TaskResult(lost, missed, merit, seconds, row[5:].numpy()))
         if stopped or any(key not in self.known for key, _ in tasks):
             raise SearchStopped
         return [self.known[key] for key, _ in tasks]
@@ -218,7 +222,7 @@ class Space:
         """x with its curvatures scaled to the focal length and the sensor at the paraxial focus, within bounds."""
         x = np.clip(x, self.lower, self.upper)
         if self.focal_length is not None:
-            x = np.clip(self._focused(x), self.lower, self.upper)
+            x = np.clip(self._focused(x, self.focal_length), self.lower, self.upper)
         last = sensor(self.model.lens), "thickness"
         of_sensor = [k for k, variable in enumerate(self.model.variables) if variable.address == last]
         if of_sensor:
@@ -233,29 +237,30 @@ class Space:
     def _state(self, x: np.ndarray) -> LensState:
         return self.model.views[self.model.lens.current_configuration - 1].state(x)
 
-    def _excess(self, x: np.ndarray) -> float:
-        """Power beyond that of the focal length, in its units."""
-        state = self._state(x)
-        data = state.gaussian(state.primary)
-        return float(-data.C / abs(data.n_image) * self.focal_length - 1)
+    def _focused(self, x: np.ndarray, focal_length: float) -> np.ndarray:
+        """x with all curvatures scaled by a factor, or else with the last curvature changed, for a focal length."""
 
-    def _focused(self, x: np.ndarray) -> np.ndarray:
-        """With all curvatures scaled by one number, or else with the last one changed."""
+        def excess(x: np.ndarray) -> float:
+            """Power beyond that of the focal length, in its units."""
+            state = self._state(x)
+            data = state.gaussian(state.primary)
+            return float(-data.C / abs(data.n_image) * focal_length - 1)
+
         curved = np.array([variable.quantity == "curvature" for variable in self.model.variables])
         if not curved.any():
             return x
         scaled = lambda s: np.where(curved, s * x, x)  # noqa: E731
-        factor = _root(lambda s: self._excess(scaled(s)), _FACTORS, lambda s: abs(np.log(abs(s))))
+        factor = _root(lambda s: excess(scaled(s)), _FACTORS, lambda s: abs(np.log(abs(s))))
         if factor is not None:
             return scaled(factor)
         last = np.nonzero(curved)[0][-1]
         moved = lambda c: np.where(np.arange(len(x)) == last, c, x)  # noqa: E731
         steps = np.linspace(self.lower[last], self.upper[last], 24)
-        last_curvature = _root(lambda c: self._excess(moved(c)), steps, abs)
+        last_curvature = _root(lambda c: excess(moved(c)), steps, abs)
         return x if last_curvature is None else moved(last_curvature)
 
 
-def _root(function: Callable, points: np.ndarray, distance: Callable) -> float | None:
+def _root(function: Callable[[float], float], points: np.ndarray, distance: Callable[[float], float]) -> float | None:
     """The root of least distance between neighbouring points within a factor; None without any."""
     values = np.array([function(point) for point in points])
     turns = np.nonzero(values[:-1] * values[1:] < 0)[0]
@@ -364,7 +369,7 @@ class SearchProblem:
     bounds: tuple[np.ndarray, np.ndarray]
     glass: Range
     air: Range
-    settings: dict
+    settings: RowOptions
 
     @cached_property
     def space(self) -> Space:

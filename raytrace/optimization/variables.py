@@ -98,7 +98,7 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
     variables: dict[str, Vary] = {name_of(variable): variable for variable in listed if not isinstance(variable, str)}
     words = split_words([word for word in listed if isinstance(word, str)])
     if variables and not words:
-        return DesignVariables(lens, tuple(vary), of_file)
+        return DesignVariables(lens, tuple(variable for variable in listed if isinstance(variable, Vary)), of_file)
     new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     for word in words:
         if "=" not in word:
@@ -176,12 +176,11 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     else:
         surfaces = [k for k in range(1, sensor(lens) + 1) if _makes_sense(lens, kind, k)]
     only = counted(word, configurations, "configuration") if configurations else []
-    numbers = [
-        variable for k in surfaces for name in _quantities(lens, kind, k, word) for variable in _each(lens, k, name)
-    ]
-    numbers = [variable for variable in numbers if not only or variable.configuration in only]
-    if numbers:
-        return tuple(dict.fromkeys(numbers))
+    each = [(k, name) for k in surfaces for name in _quantities(lens, kind, k, word)]
+    variables = [variable for k, name in each for variable in _each(lens, k, name)]
+    variables = [variable for variable in variables if not only or variable.configuration in only]
+    if variables:
+        return tuple(dict.fromkeys(variables))
     if only:
         listed = f"configuration{'s' if len(only) > 1 else ''} {', '.join(map(str, only))}"
         raise BadVariables(f"{word!r}: no such number differs in {listed}; leave @ out")
@@ -312,12 +311,10 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
     """A number of a surface, or where it differs between the configurations one for each of them."""
     for position, operand in enumerate(lens.operands):
-        addresses = [address for address, _ in addresses_of(lens, operand)] if operand.numbers is not None else []
-        if (k, quantity) in addresses:
-            address = (
-                addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)
-            )  # which the others follow
-            return [Vary(*address, number, position) for number in range(1, len(operand.numbers) + 1)]
+        addresses = [address for address, _ in addresses_of(lens, operand)]
+        if operand.numbers is not None and (k, quantity) in addresses:
+            first = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # the others follow it
+            return [Vary(*first, number, position) for number in range(1, len(operand.numbers) + 1)]
     return [Vary(k, quantity)]
 
 

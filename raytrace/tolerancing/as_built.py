@@ -154,10 +154,10 @@ class AsBuiltTerm:
 
     # -- residuals of least squares ------------------------------------------------------------------------------------
 
-    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray | None, int]:
+    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Residuals (R,) of sum weight · E[q], squared, their derivatives (R, n), and the number of failed rays.
 
-        unit: mm in the unit of length of the merit function. Derivatives of a state that has them, else None.
+        unit: mm in the unit of length of the merit function; n: 0 of a state without derivatives.
         """
         factor = (self.settings.weight / len(self.errors)) ** 0.5 / unit
         with torch.set_grad_enabled(state.count > 0):
@@ -165,7 +165,7 @@ class AsBuiltTerm:
                 self.lenses(state.moving_lens(), self.errors), self.sampling.points, fields=self.sampling.fields
             )
             offsets = factor * self._offsets(rays.position, rays.direction, rays.valid).reshape(-1)
-        slopes = tangents_of(offsets, state.count).detach().numpy().T if state.count else None
+        slopes = tangents_of(offsets, state.count).detach().numpy().T
         return value_of(offsets).detach().numpy(), slopes, int((~rays.valid).sum())
 
 

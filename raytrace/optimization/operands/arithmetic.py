@@ -9,7 +9,7 @@ from functools import reduce
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.numerics import Dual, Number, value_of
 from raytrace.optimization.lens_state import listed
 from raytrace.optimization.operands.operand import (
     SETTINGS,
@@ -71,7 +71,7 @@ def _operand(function: Callable, refers: Callable, text: str, convention: str = 
     return Operand(plan, text, convention=convention, refers=refers, bounds=bounds)
 
 
-def _finite(number):
+def _finite(number: Number) -> Number:
     """nan for an infinite number, with a derivative of 0."""
     if isinstance(number, Dual):
         return Dual(_finite(number.value), np.where(np.isfinite(number.slope), number.slope, 0.0))
@@ -98,15 +98,15 @@ def _folded(function: Callable) -> Callable:
     return lambda row, *values: reduce(function, values)
 
 
-def _above(row: Row, a):
+def _above(row: Row, a: Number) -> Number:
     return np.maximum(a, row.target)
 
 
-def _below(row: Row, a):
+def _below(row: Row, a: Number) -> Number:
     return np.minimum(a, row.target)
 
 
-def _spread(row: Row, *values):
+def _spread(row: Row, *values: Number) -> Number:
     """target + Σ (|v - mean| - target) over those further from the mean than the target."""
     mean = sum(values) / len(values)
     return row.target + sum(np.maximum(np.abs(value - mean) - row.target, 0.0) for value in values)
