@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt, value
-from raytrace.maths.result import Column, Columns, Result, Table, rows
+from raytrace.maths.result import Column, Result, Table, rows
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.optimization.operands.table import OPERANDS
@@ -101,7 +101,7 @@ class MeritResult(Result):
             lines.append(f"{lost} rows have lost their ray")
         groups, valued = [*self._groups()], self.valued()
         first = [group[0] for group in groups]
-        columns: Columns = {
+        columns: dict[Column, Any] = {
             Column("conf."): self.configurations[first],
             Column("row"): [self._numbers(group) for group in groups],
             Column("operand", form="<"): [valued[k].name for k in first],

@@ -469,7 +469,9 @@ class Choice:
         merits = self.predicted(design, waiting, waiting)
         surface = max(waiting, key=lambda k: float(merits[k].min()))
         waiting.remove(surface)
-        end, glass, predicted, tried = self.tried(design, surface, merits[surface], waiting)
+        best = self.tried(design, surface, merits[surface], waiting)
+        assert best is not None  # a model glass is no candidate itself
+        end, glass, predicted, tried = best
         self._took("snap", surface, glass, "", predicted, end, tried)
         return end
 

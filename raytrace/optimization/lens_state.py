@@ -195,10 +195,10 @@ class View:
         self.solves = sorted(solves, key=lambda solve: (solve.surface, solve.quantity == "thickness"))
         moved = (*self.variables, *(solve.address for solve in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
-        surfaces = list(lens.surfaces)
+        changed = list(lens.surfaces)
         for surface, quantity in self.moved:
-            surfaces[surface] = modelled(surfaces[surface], quantity)
-        self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
+            changed[surface] = modelled(changed[surface], quantity)
+        self.lens = dataclasses.replace(lens, surfaces=tuple(changed))
         self.stored = {address: self.number(address) for address in self.moved}
         #: Where the lens holds the numbers that move.
         self.places = {
@@ -1138,7 +1138,7 @@ class Bundle:
             if address not in of_media
         }
         of_glasses = {k: indices[:, k].clone() for k in view.glasses}
-        both: dict[Address | int, Tensor] = {**numbers, **of_glasses}
+        both: dict[Any, Tensor] = {**numbers, **of_glasses}
         places: dict[Address | int, slice] = {}
         moving: dict[Address | int, Tensor] = {}
         first, count = 0, sum(number.numel() for number in both.values())

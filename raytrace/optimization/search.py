@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -385,6 +386,7 @@ def search(
     if conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
+    run: Insertion | _Run
     if surfaces:
         run = Insertion(task, Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until), surfaces)
     else:
@@ -458,7 +460,7 @@ class _Run:
             return result
 
         keys = [f"start {i}" for i in numbers]
-        ends = self._results([(key, lambda i=i: start(i)) for key, i in zip(keys, numbers, strict=True)])
+        ends = self._results([(key, partial(start, i)) for key, i in zip(keys, numbers, strict=True)])
         self.started = numbers.stop
         best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
         self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
@@ -473,7 +475,7 @@ class _Run:
 
     def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar: Any) -> None:
         stages = [Stage(self.whole, LONG, FOLLOW, *self.bounds)]
-        ends = self._results([(key, lambda x=x: descended(x, stages, self.journal.until)) for key, x in tasks])
+        ends = self._results([(key, partial(descended, x, stages, self.journal.until)) for key, x in tasks])
         self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:

@@ -65,7 +65,7 @@ class AsBuilt:
     rings: int = 3
     arms: int = 6
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 0 < self.weight < float("inf"):
             raise ValueError(f"`weight` {self.weight:g} of the lens as built: expected a finite number above 0")
         if self.tolerances is not None and (self.grade or self.limits):

@@ -19,6 +19,7 @@ from raytrace.maths.sampling import square
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
+from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
@@ -87,7 +88,8 @@ def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tens
     scene, points, weights = sampling.of(lens)
     rays, weights = trace_scene(scene, points), (wavelength_shares(lens)[:, None] * weights).flatten(-2)
     together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
-    return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+    q0, q1, q2 = (1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+    return q0, q1, q2
 
 
 def _mean_square_angle(lens: Lens, sampling: Sampling) -> Tensor:
@@ -130,27 +132,29 @@ def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
         return 1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1)
 
     name = f"MTF at {frequency:g} cycles/mm"
-
-    def missing(number):
-        return 1 - number
-
-    return Criterion(name, "", quantity, value=missing, quantity_of=missing, sign=-1, scale=1.0, together=32)
+    return Criterion(
+        name, "", quantity, value=lambda q: 1 - q, quantity_of=lambda f: 1 - f, sign=-1, scale=1.0, together=32
+    )
 
 
-def _psf_change(lens: Lens, sampling: Sampling, model: str, pixel: float | None, size) -> Criterion:
+def _psf_change(
+    lens: Lens, sampling: Sampling, model: str, pixel: float | None, size: int | tuple[int, int] | None
+) -> Criterion:
     """RMS difference of PSFs from the nominal lens's, relative to that PSF, over the fields."""
-    kinds = {"gaussian": Gaussian, "drt": DRT}
+    kinds: dict[str, type[Gaussian] | type[DRT]] = {"gaussian": Gaussian, "drt": DRT}
     if model not in kinds:
         raise ValueError(f"model {model!r}: expected one of {', '.join(kinds)}{did_you_mean(model, kinds)}")
-    options = {"fields": sampling.fields, "pixel": pixel, "size": size}
+
+    def kernels(lens: Lens, model: str | Gaussian | DRT) -> Psf:
+        return psf(lens, model, fields=sampling.fields, pixel=pixel, size=size)
 
     with torch.no_grad():
-        order = psf(lens, model, **options).order
-        nominal = psf(lens, kinds[model](order=order), **options).kernel
+        order = kernels(lens, model).order
+        nominal = kernels(lens, kinds[model](order=order)).kernel
     energy = nominal.square().sum((-2, -1))
 
     def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
-        kernel = psf(lenses, kinds[model](order=order), **options).kernel
+        kernel = kernels(lenses, kinds[model](order=order)).kernel
         change = (kernel - nominal).square().sum((-2, -1)) / energy
         return (sampling.field_weights * change).sum(-1)
 
@@ -177,7 +181,7 @@ def _boresight(lens: Lens, sampling: Sampling) -> Criterion:
     return Criterion("boresight error", "µm", quantity, scale=1.0, angle=angle, allows_idle=True)
 
 
-def _merit(lens: Lens, merit) -> Criterion:
+def _merit(lens: Lens, merit: Merit | DefaultMerit | Sequence[Row] | str | None) -> Criterion:
     """A merit function, of the file or as `optimize` takes it; q is its square."""
     function = merit_for(lens, merit) if merit is None or isinstance(merit, Merit) else None
 
@@ -247,7 +251,7 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def at_best_focus(parabola: Sequence[Tensor], least: Tensor | float, most: Tensor | float) -> tuple[Tensor, Tensor]:
+def at_best_focus(parabola: Sequence[Tensor], least: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
     """The least of q₀ + 2 s q₁ + s² q₂ between limits of s, and s; (L,) each, differentiable."""
     q0, q1, q2 = parabola
     shift = torch.clamp(shift_to_focus(q1, q2), least, most)

@@ -23,7 +23,9 @@ def read_tolerances(path: str | PathLike, **options: Any) -> Tolerances:
         raise LensFileError("no lines of tolerances (TOL); give limits or a grade by `tolerances`", Place(file))
     numbers = []
     if Path(path).suffix.lower() == ".zmx":
-        numbers = [record.place.line for record in records(read_text(Path(path)), file) if record.keyword in _LINES]
+        numbers = [
+            record.place.line or 0 for record in records(read_text(Path(path)), file) if record.keyword in _LINES
+        ]
     return Tolerances(*read_lines(lens, lens.optimization_data.tolerances, file, numbers))
 
 

@@ -10,7 +10,7 @@ GRADES has the figures of each grade and where they are printed.
 import dataclasses
 import re
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from raytrace.materials.glass import has_abbe_number, is_air
 from raytrace.system.lens import Lens
@@ -183,9 +183,10 @@ def tolerances(
     if not (grade or words or stored.rows):
         message = 'the lens has no tolerances of its own: give `limits`, as "radius=0.1%", or `grade`, as "precision"'
         raise BadTolerance(message)
-    parts, drawn = parts_of(lens), {"distribution": distribution, "sigmas": sigmas}
+    parts = parts_of(lens)
+    drawn: dict[str, Any] = {"distribution": distribution, "sigmas": sigmas}
     rows = list(stored.rows)
-    for word, figure in GRADES.get(grade, {}).items():
+    for word, figure in GRADES[grade].items() if grade else ():
         rows += _rows(lens, parts, _Limit(word, (), -figure.limit, figure.limit, figure.unit, figure.source), drawn)
     if grade:
         rows = _at_least_fringes(lens, rows, GRADES[grade]["radius"])
@@ -260,7 +261,7 @@ def _replaces(limit: _Limit, row: Tolerance, parts: Parts) -> bool:
     return True
 
 
-def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict) -> list[Tolerance]:
+def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict[str, Any]) -> list[Tolerance]:
     """The rows of a limit at all its places, or at those of its surfaces."""
     word = _word(limit.word)
     places = [place for place in word.where(parts) if not limit.surfaces or place[0] in limit.surfaces]
@@ -273,23 +274,22 @@ def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict) -> list[Toleranc
     ends, rows = dict(parts.glasses), []
     for place in places:
         for kind in word.kinds:
-            if kind == "radius" and _is_plane(lens, place[0]):
+            if kind == "radius" and not _curvature(lens, place[0]):
                 continue
             if kind == "abbe" and not has_abbe_number(lens.surfaces[place[0]].glass):
                 continue
-            known = drawn | {"unit": limit.unit, "source": limit.source}
-            low, high = limit.minimum, limit.maximum
+            row = Tolerance(kind, tuple(place), limit.minimum, limit.maximum, source=limit.source)
             if kind == "irregularity_angle":
-                low, high, known = -90.0, 90.0, {"distribution": "uniform", "source": limit.source}
-            if kind == "thickness" and place[0] in ends:
-                known |= {"adjust": ends[place[0]]}
-            rows.append(Tolerance(kind, tuple(place), low, high, **known))
+                rows.append(dataclasses.replace(row, minimum=-90.0, maximum=90.0, distribution="uniform"))
+                continue
+            adjust = ends.get(place[0]) if kind == "thickness" else None
+            rows.append(dataclasses.replace(row, unit=limit.unit, adjust=adjust, **drawn))
     return rows
 
 
-def _is_plane(lens: Lens, k: int) -> bool:
+def _curvature(lens: Lens, k: int) -> float:
     curvature = lens.surfaces[k].curvature
-    return curvature is None or float(curvature) == 0
+    return 0.0 if curvature is None else float(curvature)
 
 
 def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> list[Tolerance]:
@@ -301,12 +301,14 @@ def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> 
     for row in rows:
         if row.kind == "radius":
             k = row.surfaces[0]
-            h, curvature = radii[k], abs(float(lens.surfaces[k].curvature))
+            h, curvature = radii[k], abs(_curvature(lens, k))
             if h > 0 and 100 * figure.fringes * 1e-3 * TEST_WAVELENGTH / (curvature * h * h) > figure.limit:
                 n = figure.fringes
                 row = dataclasses.replace(row, kind="power", minimum=-n, maximum=n, unit="fringes")
         changed.append(row)
-    planes = [k for k in parts_of(lens).faces if _is_plane(lens, k) and radii[k] > 0]
-    known = {"distribution": changed[0].distribution, "sigmas": changed[0].sigmas} if changed else {}
-    n = figure.fringes
-    return changed + [Tolerance("power", (k,), -n, n, source=figure.source, **known) for k in planes]
+    planes = [k for k in parts_of(lens).faces if not _curvature(lens, k) and radii[k] > 0]
+    n, usual = figure.fringes, changed[0] if changed else Tolerance("power", (0,), 0.0, 0.0)
+    return changed + [
+        Tolerance("power", (k,), -n, n, distribution=usual.distribution, sigmas=usual.sigmas, source=figure.source)
+        for k in planes
+    ]

@@ -9,14 +9,14 @@ and aimed anew with every number.
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.result import Column, Columns, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
 from raytrace.optimization.variables import DesignVariables, design_variables, name_of
@@ -71,11 +71,11 @@ class Jacobian(Result):
         return {"variable": self.variables}
 
     def tables(self) -> list[Table]:
-        columns = {**self.columns(), "variable": [*self.variables]}
+        columns: Columns = {**self.columns(), "variable": [*self.variables]}
         shape = " × ".join(map(str, self.value.shape)) or "one number"
         return [Table(columns, [f"derivatives of {self.quantity} ({shape}) by {len(self.variables)} numbers"])]
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         return {
             "analysis": "jacobian",
             "quantity": self.quantity,
@@ -95,6 +95,7 @@ def _directions(end: Rays) -> Tensor:
 
 
 def _paths(end: Rays) -> Tensor:
+    assert end.opl is not None
     return end.opl
 
 
@@ -207,17 +208,25 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
     return value_of(number).detach(), tangents_of(number, count).detach()
 
 
-def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> Callable[[Lens], Tensor]:
+def _of_rays(
+    quantity: Callable[[Rays], Tensor],
+    fields: Tensor | Sequence | None,
+    wavelengths: Tensor | Sequence[float] | None,
+    pupil: Tensor | tuple[Tensor, Tensor] | None,
+) -> Callable[[Lens], Tensor]:
     def function(lens: Lens) -> Tensor:
         launched = rays(lens, fields=fields, pupil=pupil, wavelengths=wavelengths)
         if quantity is not _paths:
             launched = dataclasses.replace(launched, opl=None)
+        assert launched.wavelength is not None
         return quantity(trace_lens(aligned(lens, 3), launched, launched.wavelength))
 
     return function
 
 
-def _of_merit(model: DesignVariables, lens: Lens, merit) -> tuple[Tensor, Tensor]:
+def _of_merit(
+    model: DesignVariables, lens: Lens, merit: Merit | DefaultMerit | Sequence[Row] | str | None
+) -> tuple[Tensor, Tensor]:
     """The residuals (m,) of a merit function, whose squares sum up to M², and their derivatives (n, m)."""
     function = merit_for(lens, merit)
     evaluated = Evaluation(model, function.rows, **function.options)(model.start, derivatives=True)

@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from os import PathLike
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,8 +31,9 @@ class _Trials:
 
     def __init__(self, path: str | PathLike, study: Study, seed: int):
         rows = [dataclasses.astuple(row) for row in (*study.tolerances, *study.compensators)]
-        about = {"of": "raytrace tolerance", "lens": identity(study.lens), "criterion": study.criterion.name}
-        about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength), "seed": seed}
+        about: dict[str, Any] = {"of": "raytrace tolerance", "lens": identity(study.lens)}
+        about |= {"criterion": study.criterion.name, "seed": seed}
+        about |= {"tolerances": digest(repr(rows), study.tolerances.test_wavelength)}
         about |= {"fields and pupil": digest([view.sampling for view in study.views]), "loss": study.loss}
         settings = [view.criterion.settings for view in study.views]
         about |= {"settings": digest(repr(settings))} if any(settings) else {}
@@ -42,7 +45,15 @@ class _Trials:
         self.store.append({"first": first, "rows": torch.nan_to_num(rows, nan=math.inf).tolist()})
 
 
-def monte_carlo(study: Study, trials: int, seed: int, *, checkpoint, share: Share | None, progress):
+def monte_carlo(
+    study: Study,
+    trials: int,
+    seed: int,
+    *,
+    checkpoint: str | PathLike | None,
+    share: Share | None,
+    progress: Callable[[int, str], Any] | None,
+) -> tuple[Tensor, Tensor, Tensor]:
     """The criterion (T,) of the trials, the changes (T, C) of their compensators, and their share (T,) of the light."""
     lens, sampling, count, others = study.lens, study.sampling, len(study.tolerances), len(study.compensators)
     rays = sampling.fields.shape[1] * len(lens.wavelengths) * sampling.points.shape[-1]

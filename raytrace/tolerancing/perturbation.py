@@ -14,9 +14,11 @@ thickness: the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -36,6 +38,8 @@ from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.trace import aiming_of
 from raytrace.words import did_you_mean
+
+_UNMEASURED = Gauge(None, 0.0)
 
 #: Parameters of an Irregular surface by the names of a lens.
 _IRREGULAR = {"x": 1, "y": 2, "tilt_x": 3, "tilt_y": 4, "spherical": 5}
@@ -90,7 +94,7 @@ class Perturbation:
         _follow(start, surfaces)
         numbers = list(surfaces)
         spread = [
-            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0])))
+            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0], _UNMEASURED)))
             for row, value in pairs
             for k, f in _carriers(lens, row)
         ]
@@ -132,13 +136,20 @@ def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, 
     if change is None:
         return
     k = row.surfaces[0]
-    gauge = gauges.get(k, Gauge(None, 0.0))
+    gauge = gauges.get(k, _UNMEASURED)
     if row.kind == "parameter":
         gauge = gauge._replace(path=path_of(lens.surfaces[k], row.parameter))
         surfaces[k] = modelled(surfaces[k], row.parameter)
     surfaces[k] = change(surfaces[k], value, row, gauge)
     if row.kind == "thickness" and row.adjust not in (None, k):
         surfaces[row.adjust] = change(surfaces[row.adjust], -value, row, gauge)
+
+
+def raised(surface: Surface, quantity: str, change: Tensor) -> Surface:
+    """The surface with a quantity larger by a change."""
+    path = path_of(surface, quantity)
+    assert path is not None  # the lens is checked
+    return with_number(surface, path, number_at(surface, path) + change)
 
 
 def path_of(nominal: Surface, quantity: str) -> ParameterPath | None:
@@ -167,13 +178,12 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
         k, source = solve.surface, solve.source
         others = range(source, k) if source <= k else range(k + 1, source)
         changes = [change for j in others if (change := step((j, "thickness"))) is not None]
-        return -sum(changes) if changes else None
+        return -functools.reduce(torch.add, changes) if changes else None
 
     changes = {place: step(place) for place in solves if solves[place].quantity != "glass"}
     for (k, quantity), change in changes.items():
         if change is not None:
-            surface, path = modelled(surfaces[k], quantity), path_of(lens.surfaces[k], quantity)
-            surfaces[k] = with_number(surface, path, number_at(surface, path) + change)
+            surfaces[k] = raised(modelled(surfaces[k], quantity), quantity, change)
     for (k, quantity), solve in solves.items():
         source = solve.source
         while (source, quantity) in solves and source != k:
@@ -191,10 +201,10 @@ def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
 
 def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
     """How much a number differs from that of the lens; None where it is the same tensor, or none."""
-    old, new, path = lens.surfaces[k], surfaces[k], path_of(lens.surfaces[k], quantity)
-    if old is new or path is None:
+    path = path_of(lens.surfaces[k], quantity)
+    if lens.surfaces[k] is surfaces[k] or path is None:
         return None
-    old, new = (_part(surface, path) for surface in (old, new))
+    old, new = _part(lens.surfaces[k], path), _part(surfaces[k], path)
     if new is None or new is old:
         return None
     return (new if old is None else new - old)[() if path.entry is None else path.entry]
@@ -202,7 +212,7 @@ def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) 
 
 def _part(surface: Surface, path: ParameterPath) -> Tensor | None:
     """The tensor at a path, of all its entries; None where it is not modelled."""
-    part = surface
+    part: Any = surface
     for name in path.path:
         part = getattr(part, name, None)
     return part
@@ -233,8 +243,9 @@ def _add_sags(surfaces: list[Surface], parts: Sequence[tuple[Tolerance, int, Ten
     """Add the powers of all errors of a surface to its sag."""
     sums: dict[tuple[int, float], list[Tensor]] = {}
     for row, k, value in parts:
-        gauge = gauges[row.surfaces[0]]
-        terms = KINDS[row.kind].sag(value, row, gauge)
+        gauge, sag = gauges[row.surfaces[0]], KINDS[row.kind].sag
+        assert sag is not None
+        terms = sag(value, row, gauge)
         old = sums.get((k, gauge.radius), [])
         pairs = itertools.zip_longest(old, terms)
         sums[k, gauge.radius] = [b if a is None else a if b is None else a + b for a, b in pairs]
@@ -253,17 +264,19 @@ def _move(
     parts: Sequence[tuple[Tolerance, int, Tensor]],
 ) -> list[tuple[int, int]]:
     """Move surfaces and elements rigidly; returns the first and last surface of each that moves."""
-    of_surfaces: dict[int, dict[str, Tensor]] = {}
+    of_surfaces: dict[int, dict[str, Any]] = {}
     for row, k, value in parts:
         _add_to(of_surfaces.setdefault(k, {}), KINDS[row.kind].motion, value)
-    of_elements: dict[tuple[int, int, float], dict[str, Tensor]] = {}
+    of_elements: dict[tuple[int, int, float], dict[str, Any]] = {}
     for row, value in pairs:
         kind = KINDS[row.kind]
         if kind.elements:
             _add_to(of_elements.setdefault((*_range(row), row.pivot), {}), kind.motion, value)
     # From the outermost to the innermost: a longer range holds a shorter one.
     ranges = sorted(of_elements, key=lambda place: place[0] - place[1])
-    still, before, behind = tuple(surfaces), defaultdict(list), defaultdict(list)
+    still = tuple(surfaces)
+    before: dict[int, list[Pose]] = defaultdict(list)
+    behind: dict[int, list[Rows]] = defaultdict(list)
     for first, last, pivot in ranges:
         motion, z = Pose(**of_elements[first, last, pivot]), still[first].thickness.new_tensor(pivot)
         motions = [Pose(z=z), motion, Pose(z=-z)] if pivot else [motion]
@@ -272,8 +285,8 @@ def _move(
         behind[last].insert(0, rows_of_both(rows_of_both(rows_back(way), back), way))
     for k in {*before, *behind, *of_surfaces}:
         surface, of_surface = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
-        front = [pose for pose in (*before[k], surface.before, *of_surface) if pose is not None]
-        rear = [pose for pose in (*map(undone, of_surface), surface.after) if pose is not None]
+        front = [pose for pose in (*before[k], surface.before, *of_surface) if isinstance(pose, Pose)]
+        rear = [pose for pose in (*map(undone, of_surface), surface.after) if isinstance(pose, Pose)]
         rows = rows_along(rear)
         for element in behind[k]:
             rows = rows_of_both(rows, element)
@@ -286,7 +299,7 @@ def _move(
     return [(first, last) for first, last, _ in ranges] + [(k, k) for k in of_surfaces]
 
 
-def _add_to(motion: dict[str, Tensor], field: str, value: Tensor) -> None:
+def _add_to(motion: dict[str, Any], field: str, value: Tensor) -> None:
     motion[field] = motion[field] + value if field in motion else value
 
 
@@ -294,9 +307,9 @@ def _range(row: Tolerance) -> tuple[int, int]:
     return row.surfaces[0], row.surfaces[-1]
 
 
-def _way(surfaces: Sequence[Surface]) -> list[Pose | Tensor | None]:
+def _way(surfaces: Sequence[Surface]) -> list[Any]:
     """The poses and thicknesses from the axes in front of the first surface to those behind the last."""
-    steps: list[Pose | Tensor | None] = []
+    steps: list[Any] = []
     for surface in surfaces:
         steps += [surface.before, surface.after, surface.thickness]
     return steps[:-1]
@@ -322,9 +335,10 @@ def _pose(rows: Rows, k: int) -> Pose:
 def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Tensor]]) -> Lens:
     """The lens with errors, or with changes of compensators, of operands of configurations."""
     for row, value in pairs:
+        assert row.operand is not None
         operand = lens.operands[row.operand]
         if value.dim() and any(isinstance(scaled.path[-1], tuple) for scaled in operand.paths):
-            raise BadTolerance(f"{_named(row)}: a coefficient that differs between configurations; expected one lens")
+            raise BadTolerance(f"{row}: a coefficient that differs between configurations; expected one lens")
         lens = dataclasses.replace(
             lens, operands=tuple(_raised(old, row, value) if old is operand else old for old in lens.operands)
         )
@@ -336,6 +350,7 @@ def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Ten
 
 def _raised(operand: configurations.Operand, row: Tolerance | Compensator, value: Tensor) -> configurations.Operand:
     k = row.configuration - 1
+    assert operand.numbers is not None  # the lens is checked
     numbers = configurations.with_entry(operand.numbers, (k,), operand.numbers[k] + value)
     return dataclasses.replace(operand, numbers=numbers)
 
@@ -349,18 +364,18 @@ def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[in
     def differs(path: configurations.Path) -> bool:
         if path[0] != "surfaces":
             return False
-        posed = path[2] in ("before", "after")
-        return any(a <= path[1] <= b if posed else path[2] == "thickness" and a <= path[1] < b for a, b in moved)
+        k, posed = cast(int, path[1]), path[2] in ("before", "after")
+        return any(a <= k <= b if posed else path[2] == "thickness" and a <= k < b for a, b in moved)
 
     if any(differs(scaled.path) for operand in lens.operands for scaled in operand.paths):
         return ()
     changed, operands = dataclasses.replace(lens, surfaces=numbers), []
     for operand in lens.operands:
-        path = operand.paths[0].path if operand.paths and operand.numbers is not None else None
-        old, new = (None, None) if path is None else (configurations.part(view, path) for view in (lens, changed))
-        if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old and not isinstance(path[-1], tuple):
-            step = (new - old) / operand.paths[0].factor
-            operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
+        if operand.paths and operand.numbers is not None and not isinstance(operand.paths[0].path[-1], tuple):
+            old, new = (configurations.part(view, operand.paths[0].path) for view in (lens, changed))
+            if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old:
+                step = (new - old) / operand.paths[0].factor
+                operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
         operands.append(operand)
     return tuple(operands)
 
@@ -374,7 +389,8 @@ def _named(row: Tolerance) -> str:
 
 def check_tolerances(lens: Lens, rows: Iterable[Tolerance]) -> None:
     """Refuse tolerances that a lens does not have. Raises BadTolerance naming what was found and expected."""
-    last, ranges = len(lens.surfaces) - 1, {}
+    last = len(lens.surfaces) - 1
+    ranges: dict[tuple[int, int], Tolerance] = {}
     solves = _solves(lens)
     for row in rows:
         if row.kind not in KINDS:

@@ -8,7 +8,7 @@ with the exact gradient and differences of gradients, all lenses of a batch at o
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from scipy.special import ndtr
@@ -18,11 +18,11 @@ from raytrace.analysis.setting import scene_of
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
 from raytrace.system import configurations
 from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis, per_lens
-from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
+from raytrace.system.parameter_paths import modelled, parameter_paths, sensor
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus, light, size_of_image
-from raytrace.tolerancing.perturbation import Perturbation, path_of, with_operands
+from raytrace.tolerancing.perturbation import Perturbation, path_of, raised, with_operands
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
@@ -37,6 +37,10 @@ _RINGS, _SAME = (4, 6, 8), 1e-4  # rings of the pupil that are tried, and the ac
 _CLIPPED = (4, 16), (6, 24), (8, 32), (8, 64), (12, 96)  # rings and arms where apertures clip beams; the last are exact
 #: Lenses traced at once.
 CHUNK = 1024
+
+
+#: Fields, as of `field_points`.
+FieldPoints: TypeAlias = Tensor | Sequence | None
 
 
 class View(NamedTuple):
@@ -72,12 +76,16 @@ class Study:
             zero = self.half.new_zeros(1, len(self.half))
             self.nominal_light = self._of_views(light, zero, zero.new_zeros(1, len(self.compensators)))
 
-    def _of_views(self, judge: Callable[[Lens, Sampling], Tensor], errors: Tensor, changes: Tensor) -> Tensor:
-        """A number (V, L) of every configuration of lenses with errors (L, N) and compensators moved by (L, C)."""
+    def _of_views(self, judge: Callable[[Lens, Sampling], Tensor] | None, errors: Tensor, changes: Tensor) -> Tensor:
+        """A number (V, L) of every configuration of lenses with errors (L, N) and compensators moved by (L, C).
+
+        judge: the number, by default the quantity of the criterion.
+        """
         values = []
         for view, perturbation in zip(self.views, self.perturbations, strict=True):
             lens = aligned(with_changes(perturbation(errors), self.compensators, changes), 3)
-            values.append((judge or view.criterion.quantity)(lens, view.sampling).expand(len(errors)))
+            number = view.criterion.quantity if judge is None else judge
+            values.append(number(lens, view.sampling).expand(len(errors)))
         return torch.stack(values)
 
     def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
@@ -117,7 +125,8 @@ class Study:
                 gradients = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
             slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(gradients, asked, strict=True)]
             rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1]))
-        return tuple(torch.cat(part) for part in zip(*rows, strict=True))
+        q, by_e, by_c = map(torch.cat, zip(*rows, strict=True))
+        return q, by_e, by_c
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) with the compensators that minimise it, their changes (L, C), and the share of the nominal light (L,).
@@ -132,7 +141,8 @@ class Study:
                 changes = changes.nan_to_num(0.0)  # of a lens with a field without light
                 kept = self.light(some, changes)
                 parts.append((torch.where(1 - kept > self.loss, torch.nan, q), changes, kept))
-        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+        q, changes, kept = map(torch.cat, zip(*parts, strict=True))
+        return q, changes, kept
 
     def _compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
         changes = errors.new_zeros(len(errors), len(self.compensators))
@@ -201,12 +211,12 @@ class Study:
         least, name = _NO_EFFECT * (float(q.min()) + self.criterion.scale), self.criterion.name
         for compensator, gain in zip(self.compensators, effect.tolist(), strict=True):
             if abs(gain) <= least and not self.criterion.allows_idle:
-                what = f"it does not improve the criterion: it has no effect on the {name}"
-                raise BadTolerance(f"compensator {compensator}: {what}; leave it out")
+                reason = f"it does not improve the criterion: it has no effect on the {name}"
+                raise BadTolerance(f"compensator {compensator}: {reason}; leave it out")
             if gain < -least:
-                what = f"the {name} has no optimum near the nominal lens"
+                reason = f"the {name} has no optimum near the nominal lens"
                 raise BadTolerance(
-                    f"compensator {compensator}: {what}; focus the lens first (rt.focus), or optimise it"
+                    f"compensator {compensator}: {reason}; focus the lens first (rt.focus), or optimise it"
                 )
         return effect.abs() > least
 
@@ -239,10 +249,10 @@ class Study:
         mixed, curvature = whole[:count, acting], whole[acting][:, acting]
         response = -torch.linalg.solve(curvature, mixed.T).T
         start = -torch.linalg.solve(curvature, slope[acting])
-        limits = ((limit - best[0])[acting - count] for limit in (self.least, self.most))
+        least, most = ((limit - best[0])[acting - count] for limit in (self.least, self.most))
         return SecondOrder(
             q[-1] + 0.5 * start @ slope[acting], slope[:count] + mixed @ start,
-            whole[:count, :count] + mixed @ response.T, start, response, curvature, *limits,
+            whole[:count, :count] + mixed @ response.T, start, response, curvature, least, most,
         )  # fmt: skip
 
 
@@ -265,8 +275,7 @@ def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tenso
     surfaces = list(lens.surfaces)
     for compensator, change in (pair for pair in pairs if pair[0].operand is None):
         surface = modelled(surfaces[compensator.surface], compensator.parameter)
-        path = path_of(surface, compensator.parameter)
-        surfaces[compensator.surface] = with_number(surface, path, number_at(surface, path) + change)
+        surfaces[compensator.surface] = raised(surface, compensator.parameter, change)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
@@ -306,7 +315,11 @@ def _moments(row: Tolerance) -> tuple[float, float]:
 
 
 def views_of(
-    lens: Lens, criterion: Callable[[Lens, Sampling], Criterion], fields, rings: int | None, arms: int | None
+    lens: Lens,
+    criterion: Callable[[Lens, Sampling], Criterion],
+    fields: FieldPoints,
+    rings: int | None,
+    arms: int | None,
 ) -> list[View]:
     """The configurations of a lens that have a weight with their criteria, made of each and of its sampling."""
     views, weights = [], configurations.weights(lens.operands)
@@ -317,7 +330,7 @@ def views_of(
     return views
 
 
-def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | None = None) -> Sampling:
+def sampling_of(lens: Lens, fields: FieldPoints = None, rings: int | None = None, arms: int | None = None) -> Sampling:
     """Fields and pupil points of a lens and of lenses near it.
 
     fields: by default those of the lens with their weights; as errors are not symmetric, a lens that is round about its
@@ -325,7 +338,6 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
     pupil (`tracing.clear_pupil`) of each lens near a nominal one that clips rays; by default the fewest that give the
     mean square spot radius of `spot` to _SAME, and where rays are clipped the wavefront's variance, too.
     """
-    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
     weights = lens.fields.weight if fields is None else torch.ones_like(points[0])
     if fields is None and is_round_about_axis(lens):
@@ -338,11 +350,15 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
 
     finest = SAMPLINGS["gauss"][2]
     view = scene_of(lens, points)
-    clips = is_clipped(view, gauss_rings(finest if rings is None else rings, arms, **like)[0])
+
+    def gauss(rings: int, arms: int | None) -> tuple[Tensor, Tensor]:
+        return gauss_rings(rings, arms, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+
+    clips = is_clipped(view, gauss(finest if rings is None else rings, arms)[0])
 
     def rule(rings: int, arms: int | None) -> Sampling:
         clear = arms_of(view, arms or 4 * rings) if clips else None
-        pupil, shares = clear.rule(rings) if clips else gauss_rings(rings, arms, **like)
+        pupil, shares = gauss(rings, arms) if clear is None else clear.rule(rings)
         return Sampling(points, weights, pupil, shares, rings, clear)
 
     with torch.no_grad():

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.criteria import Criterion, criterion_of
+from raytrace.tolerancing.criteria import Criterion, Sampling, criterion_of
 from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
@@ -30,6 +30,9 @@ from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
 from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -60,7 +63,7 @@ class Toleranced(Result):
     """
 
     lens: Lens
-    tolerances: object
+    tolerances: Tolerances
     criterion: str
     unit: str
     nominal: Tensor
@@ -86,7 +89,7 @@ class Toleranced(Result):
     angle: float = 0.0
     goal: float | None = None
     share: float = 0.9
-    given: object = None
+    given: Tolerances | None = None
     better: str = "smaller"
 
     COLUMNS = property(
@@ -129,7 +132,7 @@ class Toleranced(Result):
     def labels(self) -> list[str]:
         """Kind and place of every row in words; of the first row of a group those of all its rows."""
         labels = self.tolerances.labels
-        for first, *_, last in (places for places in groups_of(self.tolerances) if len(places) > 1):
+        for first, *_, last in (places for places in groups_of(self.tolerances.rows) if len(places) > 1):
             labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
         return labels
 
@@ -328,12 +331,12 @@ class Toleranced(Result):
             )
         return tables
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
         return about | ({"unread": list(self.tolerances.unread)} if self.tolerances.unread else {})
 
     @styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
         figure = new_figure(9.0, 4.2)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
@@ -448,8 +451,11 @@ def tolerance(
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= light_loss <= 1:
         raise ValueError(f"light_loss {light_loss:g}: expected a share of the light between 0 and 1, as 0.05")
-    options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
-    views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
+
+    def criterion_near(view: Lens, sampling: Sampling) -> Criterion:
+        return criterion_of(criterion, view, sampling, model=model, pixel=pixel, size=size, merit=merit)
+
+    views = views_of(lens, criterion_near, fields, rings, arms)
     chosen, study, given = views[0].criterion, Study(views, tolerances, light_loss), tolerances
     if study.compensators:
         study.nominal_curvature()  # refuses those without effect

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -121,10 +122,10 @@ class Tolerances(Result):
         notes = [f"compensator: {compensator}" for compensator in self.compensators]
         return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         """The rows and compensators as plain values."""
 
-        def plain(row) -> dict:
+        def plain(row: Tolerance | Compensator) -> dict[str, Any]:
             fields = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
             stated = {name: part for name, part in fields.items() if part not in ("", None, ())}
             return {name: number(part) if isinstance(part, float) else part for name, part in stated.items()}

@@ -273,7 +273,7 @@ class Wave:
 
     def __call__(self, context: EvaluationContext) -> Sequence | None:
         if self._last[0] is not context:
-            numbers = context.once(_by_few_rays, self.planner.shared(AllWaves)).get(self)
+            numbers: Sequence | None = context.once(_by_few_rays, self.planner.shared(AllWaves)).get(self)
             if numbers is None:
                 numbers = self._on_grid(context)
             else:
