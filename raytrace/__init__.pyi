@@ -78,8 +78,8 @@ from raytrace.optimization.merit import DefaultMerit as DefaultMerit
 from raytrace.optimization.merit import Merit as Merit
 from raytrace.optimization.operands.operand import Conventions as Conventions
 from raytrace.optimization.operands.operand import Measure as Measure
-from raytrace.optimization.optimize import Optimized as Optimized
 from raytrace.optimization.optimize import optimize as optimize
+from raytrace.optimization.optimized import Optimized as Optimized
 from raytrace.optimization.problem import Condition as Condition
 from raytrace.optimization.problem import NoProblem as NoProblem
 from raytrace.optimization.search import Searched as Searched
@@ -116,6 +116,8 @@ from raytrace.system.rays import Rays as Rays
 from raytrace.system.surface import Surface as Surface
 from raytrace.system.tolerance_data import Compensator as Compensator
 from raytrace.system.tolerance_data import Tolerance as Tolerance
+from raytrace.tolerancing.analysis import Toleranced as Toleranced
+from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements
@@ -125,10 +127,8 @@ from raytrace.tolerancing.jacobian import Jacobian as Jacobian
 from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
-from raytrace.tolerancing.toleranced import Toleranced as Toleranced
-from raytrace.tolerancing.toleranced import tolerance as tolerance
-from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance
-from raytrace.tolerancing.tolerances import Tolerances as Tolerances
+from raytrace.tolerancing.table import BadTolerance as BadTolerance
+from raytrace.tolerancing.table import Tolerances as Tolerances
 from raytrace.tracing.base_ray import BaseRay as BaseRay
 from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiled import prepare as prepare

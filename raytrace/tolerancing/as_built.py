@@ -26,10 +26,10 @@ from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
-from raytrace.tolerancing.grades import tolerances as tolerances_of
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.study import focuses, moments, sampling_of
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.spot import image_rays
@@ -51,15 +51,15 @@ class AsBuilt:
     E[q] is the expected mean square spot radius of the manufactured and refocused lens, in the square of the unit of
     length of the merit function; of merit="spot" M² is that of the nominal lens.
 
-    grade, limits: of `tolerances`, by default those of the lens's file; tolerances: instead of both. weight: above 0;
-    a large one minimises the lens as built alone. fields: as of `tolerance`, by default those of the lens, mirrored
-    along y; rings, arms: of the pupil. Raises BadTolerance, ValueError.
+    grade, limits: of `tolerance_table`, by default those of the lens's file; tolerances: instead of both. weight: above
+    0; a large one minimises the lens as built alone. fields: as of `tolerance_analysis`, by default those of the lens,
+    mirrored along y; rings, arms: of the pupil. Raises BadTolerance, ValueError.
     """
 
     grade: str | None = None
     limits: str | Sequence[str] = ""
     _: KW_ONLY
-    tolerances: Tolerances | None = None
+    tolerances: ToleranceTable | None = None
     weight: float = 1.0
     fields: Tensor | Sequence | None = None
     rings: int = 3
@@ -91,7 +91,7 @@ class AsBuiltTerm:
     def __init__(self, settings: AsBuilt, lens: Lens):
         prepare()
         self.settings, rows = settings, settings.tolerances
-        self.tolerances = tolerances_of(lens, settings.limits, grade=settings.grade) if rows is None else rows
+        self.tolerances = tolerance_table(lens, settings.limits, grade=settings.grade) if rows is None else rows
         if not len(self.tolerances):
             raise BadTolerance("no tolerances; give a `grade`, `limits` or `tolerances`")
         self.limits = _focus_limits(lens, self.tolerances)
@@ -169,7 +169,7 @@ class AsBuiltTerm:
         return value_of(offsets).detach().numpy(), slopes, int((~rays.valid).sum())
 
 
-def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:
+def _focus_limits(lens: Lens, tolerances: ToleranceTable) -> tuple[float, float]:
     """Limits in mm of the motion of the sensor, 0 and 0 without a compensator. Raises BadTolerance."""
     compensators = tolerances.compensators
     if not compensators:
@@ -186,7 +186,7 @@ def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:
 # -- the sample --------------------------------------------------------------------------------------------------------
 
 
-def design(tolerances: Tolerances) -> Tensor:
+def design(tolerances: ToleranceTable) -> Tensor:
     """Errors (L, N) of the sample in the rows' units, float64."""
     mean, variance = (np.array(part) for part in zip(*map(moments, tolerances), strict=True))
     signs = hadamard(len(tolerances) + 1)[:, 1 : len(tolerances) + 1]

@@ -19,7 +19,7 @@ from raytrace.system.tolerance_data import KINDS, TEST_WAVELENGTH, Compensator, 
 from raytrace.tolerancing.elements import cemented_groups, lens_elements
 from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.perturbation import check_tolerances
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.words import did_you_mean
 
@@ -153,7 +153,7 @@ WORDS = {
 _LIMITS = re.compile(r"([a-z_]+)(?::([\d,-]+))?=(?:([^%]+?)\.\.)?([^%]+?)(%?)")
 
 
-def tolerances(
+def tolerance_table(
     lens: Lens,
     limits: str | Sequence[str] = "",
     *,
@@ -161,7 +161,7 @@ def tolerances(
     distribution: str = "normal",
     sigmas: float = 2.0,
     compensators: Sequence[Compensator] | None = None,
-) -> Tolerances:
+) -> ToleranceTable:
     """The tolerances of every surface, element and gap of a lens: of a grade, of limits, or of its file.
 
     limits: "radius=0.1% thickness=0.02 element_tilt=0.05": words and kinds with their limits ± in mm, degrees, fringes
@@ -179,7 +179,7 @@ def tolerances(
     if grade is not None and grade not in GRADES:
         raise BadTolerance(f"grade {grade!r}{did_you_mean(grade, GRADES)}: expected one of {', '.join(GRADES)}")
     words = _parsed(joined(limits))
-    stored = tolerances_of(lens) if grade is None else Tolerances(())
+    stored = tolerances_of(lens) if grade is None else ToleranceTable(())
     if not (grade or words or stored.rows):
         message = 'the lens has no tolerances of its own: give `limits`, as "radius=0.1%", or `grade`, as "precision"'
         raise BadTolerance(message)
@@ -201,6 +201,10 @@ def tolerances(
     changed = len(rows) != len(stored.rows) or any(a is not b for a, b in zip(rows, stored.rows, strict=True))
     saves = () if changed else stored.saves  # which count the rows of the file
     return dataclasses.replace(stored, rows=tuple(rows), compensators=tuple(compensators), saves=saves)
+
+
+#: Former name.
+tolerances = tolerance_table
 
 
 class _Limit(NamedTuple):

@@ -24,9 +24,9 @@ from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.grades import tolerances as tolerances_of
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.perturbation import Perturbation
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import rays
 from raytrace.tracing.trace import trace_lens
 from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value
@@ -112,7 +112,7 @@ def jacobian(
     vary: str | Sequence[str | Vary] | None = None,
     *,
     of: str | Callable[[Lens], Tensor] = "landing points",
-    tolerances: Tolerances | Iterable[Tolerance] | None = None,
+    tolerances: ToleranceTable | Iterable[Tolerance] | None = None,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
     fields: Tensor | Sequence | None = None,
@@ -127,8 +127,8 @@ def jacobian(
     less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,)
     of a merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor
     (...), as lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0,
-    as of `perturbed`; grade, limits: as of `tolerances` instead. Derivatives are exact to rounding; failed rays have 0.
-    Raises BadVariables, BadTolerance, TypeError, ValueError.
+    as of `perturbed`; grade, limits: as of `tolerance_table` instead. Derivatives are exact to rounding; failed rays
+    have 0. Raises BadVariables, BadTolerance, TypeError, ValueError.
     """
     of_rays = [
         name
@@ -167,7 +167,7 @@ def jacobian(
             moving = model.lens_at(numbers[: len(model.variables)])
             moving = moving if perturbation is None else perturbation(numbers[len(model.variables) :], moving)
         quantity, derivatives = derivatives_of(function, moving, len(start))
-    rows = () if perturbation is None else Tolerances(perturbation.rows).labels
+    rows = () if perturbation is None else ToleranceTable(perturbation.rows).labels
     return Jacobian(
         quantity,
         derivatives,
@@ -178,14 +178,14 @@ def jacobian(
 
 
 def _perturbation(
-    lens: Lens, tolerances: Tolerances | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
+    lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
 ) -> Perturbation | None:
     """The lens with the errors that are asked for; None: with none."""
     if tolerances is not None and (grade or limits):
         raise ValueError("jacobian: `tolerances` are given: leave `grade` and `limits` out")
     if tolerances is None and not (grade or limits):
         return None
-    return Perturbation(lens, tolerances_of(lens, limits, grade=grade) if tolerances is None else tolerances)
+    return Perturbation(lens, tolerance_table(lens, limits, grade=grade) if tolerances is None else tolerances)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:

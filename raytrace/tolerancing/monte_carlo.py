@@ -14,7 +14,7 @@ from raytrace.stores import Kind, Records, listed, number, record, whole
 from raytrace.system.identity import digest, identity
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.study import CHUNK, Study
-from raytrace.tolerancing.tolerances import BadTolerance
+from raytrace.tolerancing.table import BadTolerance
 from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 
 _JOURNAL = Kind(

@@ -33,7 +33,7 @@ from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, ro
 from raytrace.system.sag_terms import with_powers
 from raytrace.system.surface import Surface, with_z_in_thicknesses
 from raytrace.system.tolerance_data import KINDS, MOST_TERM, Compensator, Gauge, Tolerance
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.trace import aiming_of
@@ -45,11 +45,11 @@ _UNMEASURED = Gauge(None, 0.0)
 _IRREGULAR = {"x": 1, "y": 2, "tilt_x": 3, "tilt_y": 4, "spherical": 5}
 
 
-def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: Tensor | Sequence[float]) -> Lens:
+def perturbed(lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance], errors: Tensor | Sequence[float]) -> Lens:
     """The lens with an error for each tolerance.
 
-    tolerances: `Tolerances`, or rows; errors: (N,) in the rows' units, or (L, N) for L lenses at once, whose numbers
-    that differ from lens to lens then are (L, 1, 1, 1) and broadcast against rays (lens, field, wavelength, pupil).
+    tolerances: a table, or rows; errors: (N,) in the rows' units, or (L, N) for L lenses at once, whose numbers that
+    differ from lens to lens then are (L, 1, 1, 1) and broadcast against rays (lens, field, wavelength, pupil).
     Differentiable in the errors and in the lens. Numbers that no error touches stay the same tensors.
     A lens of several configurations is perturbed in all of them, and loses the others where an element moves whose
     thicknesses or poses differ between them: perturb each `lens.configuration(k)` then. Pickups and position solves
@@ -63,10 +63,10 @@ def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: 
 class Perturbation:
     """A lens with its tolerances, checked once and applied to any errors: `perturbed` for many batches of one lens."""
 
-    def __init__(self, lens: Lens, tolerances: Tolerances | Iterable[Tolerance]):
+    def __init__(self, lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance]):
         # The perturbed lens, whose axis bends, finds its stop as the nominal one does.
         self.lens, self.rows = with_ray_aiming(lens, aiming_of(lens)), rows_of(tolerances)
-        fringes = tolerances if isinstance(tolerances, Tolerances) else Tolerances(self.rows)
+        fringes = tolerances if isinstance(tolerances, ToleranceTable) else ToleranceTable(self.rows)
         self.wavelength = 1e-3 * fringes.test_wavelength
         check_tolerances(lens, self.rows)
         needed = any(KINDS[row.kind].needs_semi_diameter for row in self.rows)

@@ -25,7 +25,7 @@ from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best
 from raytrace.tolerancing.perturbation import Perturbation, path_of, raised, with_operands
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.clear_pupil import arms_of, is_clipped
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
@@ -59,7 +59,7 @@ class Study:
     in any of them, that a lens may lose; one that loses more has no criterion, q is nan.
     """
 
-    def __init__(self, views: Sequence[View], tolerances: Tolerances, loss: float):
+    def __init__(self, views: Sequence[View], tolerances: ToleranceTable, loss: float):
         self.views, self.tolerances, self.loss = views, tolerances, loss
         self.lens, self.criterion, self.sampling, _ = views[0]
         self.perturbations = [Perturbation(view.lens, tolerances) for view in views]

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 
 _HALVINGS = 30  # of a limit, to 1e-9 of it
 _DRAWS, _OTHERS = 4096, 2**15  # of the second-order model, by which factors are found, and others that judge them
@@ -39,15 +39,17 @@ _SOFT = 0.05  # width of the logistic curve, in standard deviations of q
 _LEAST = 1e-3  # scale of a limit
 
 
-def scaled(tolerances: Tolerances, low: Tensor, high: Tensor) -> Tolerances:
-    """Tolerances whose limits are those times factors (N,)."""
+def scaled(tolerances: ToleranceTable, low: Tensor, high: Tensor) -> ToleranceTable:
+    """The tolerances with limits multiplied by factors (N,)."""
     pairs = zip(tolerances.rows, low.tolist(), high.tolist(), strict=True)
     rows = [dataclasses.replace(row, minimum=a * row.minimum, maximum=b * row.maximum) for row, a, b in pairs]
     return dataclasses.replace(tolerances, rows=tuple(rows))
 
 
-def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor], increment: float) -> Tolerances:
-    """Tolerances whose errors, each alone at a limit, change the criterion by `increment` at most.
+def limited_to_change(
+    tolerances: ToleranceTable, change: Callable[[Tensor], Tensor], increment: float
+) -> ToleranceTable:
+    """The tolerances with limits at which errors, each alone at its limit, change the criterion by `increment` at most.
 
     change: errors (L, N) -> how much worse the criterion is (L,). Limits that do less harm stay. Where the change is no
     monotonic function of the error, one place is found at which it passes the increment.
@@ -69,14 +71,14 @@ def limited_to_change(tolerances: Tolerances, change: Callable[[Tensor], Tensor]
 
 
 def limited_to_yield(
-    tolerances: Tolerances,
+    tolerances: ToleranceTable,
     model: SecondOrder,
     traced: Callable[[Tensor], Tensor],
     goal: float,
     share: float,
     seed: int,
-) -> Tolerances:
-    """Tolerances of least total tightness by which a share of the lenses, as they are traced, has q ≤ goal.
+) -> ToleranceTable:
+    """The tolerances of least total tightness by which a share of the lenses, as they are traced, has q ≤ goal.
 
     traced: errors (L, N) -> q (L,), nan of a lens that fails. Limits that already give the share stay as they are.
     Raises BadTolerance where the lens without errors does not reach the goal.
@@ -111,7 +113,7 @@ def limited_to_yield(
     return scaled(tolerances, best, best)
 
 
-def _least_tight(tolerances: Tolerances, model: SecondOrder, goal: float, share: float, seed: int) -> Tensor:
+def _least_tight(tolerances: ToleranceTable, model: SecondOrder, goal: float, share: float, seed: int) -> Tensor:
     """Factors (N,) of least total tightness by which a share of the lenses has q ≤ goal in the second-order model."""
     errors = draw_errors(tolerances, _DRAWS, seed).to(model.g)
 

@@ -22,14 +22,14 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.tolerance_data import Tolerance
 from raytrace.tolerancing.criteria import Criterion, Sampling, criterion_of
-from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable, groups_of
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +42,7 @@ _NEGATIVE = 0.02  # accepted share of draws whose mean square is negative by sec
 
 
 @value
-class Toleranced(Result):
+class ToleranceAnalysis(Result):
     """The lens as built.
 
     better: "smaller" or "larger", which values of the criterion are better; angle: radians of its unit, 0 for no angle.
@@ -63,7 +63,7 @@ class Toleranced(Result):
     """
 
     lens: Lens
-    tolerances: Tolerances
+    tolerances: ToleranceTable
     criterion: str
     unit: str
     nominal: Tensor
@@ -89,7 +89,7 @@ class Toleranced(Result):
     angle: float = 0.0
     goal: float | None = None
     share: float = 0.9
-    given: Tolerances | None = None
+    given: ToleranceTable | None = None
     better: str = "smaller"
 
     COLUMNS = property(
@@ -375,9 +375,9 @@ def _factor(new: Tolerance, old: Tolerance) -> float:
     return (new.maximum - new.minimum) / wide if wide else 1.0
 
 
-def tolerance(
+def tolerance_analysis(
     lens: Lens,
-    tolerances: Tolerances | None = None,
+    tolerances: ToleranceTable | None = None,
     *,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
@@ -398,16 +398,16 @@ def tolerance(
     checkpoint: str | PathLike | None = None,
     share: Share | None = None,
     progress: Callable | None = None,
-) -> Toleranced:
+) -> ToleranceAnalysis:
     """The lens as built: sensitivities, expectation by second order and Monte Carlo.
 
     A lens of several configurations is judged in all of them, by the mean of what the compensators minimise, by the
     weights that its file gives them (CWGT), alike without.
     `lens.configuration(2)` of a lens read alone: leave its others out by `operands=()`.
 
-    tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`
-        and `limits`.
-    grade: tolerances of published grades instead of the file's, see `tolerances`.
+    tolerances: as `tolerance_table` or `read_tolerances` return them; by default those of the lens's own file, or of
+        `grade` and `limits`.
+    grade: tolerances of published grades instead of the file's, see `tolerance_table`.
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
@@ -441,7 +441,7 @@ def tolerance(
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
-        tolerances = tolerances_of_grade(lens, limits, grade=grade)
+        tolerances = tolerance_table(lens, limits, grade=grade)
     elif grade or limits:
         raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
     if not len(tolerances):
@@ -486,7 +486,7 @@ def tolerance(
     low, high = (chosen.sign * changes).chunk(2)
     light_low, light_high = (1 - light).chunk(2)
     rss = (0.5 * (low**2 + high**2)).nansum().sqrt()
-    return Toleranced(
+    return ToleranceAnalysis(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal, minimum=low,
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
         slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
@@ -496,6 +496,10 @@ def tolerance(
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
+
+
+#: Former names.
+Toleranced, tolerance = ToleranceAnalysis, tolerance_analysis
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:

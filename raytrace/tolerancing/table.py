@@ -1,4 +1,5 @@
-"""Tolerances: the rows of a lens, what is adjusted after manufacture, and the wavelength of the test."""
+"""Table of tolerances: the rows of a lens, the compensators that are adjusted after manufacture, and the wavelength of
+the test."""
 
 import dataclasses
 import itertools
@@ -19,8 +20,8 @@ class BadTolerance(RaytraceError, ValueError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tolerances(Result):
-    """Tolerances of a lens: `print(tolerances)` shows them, `tolerances[3]` is a row, `len(tolerances)` their number.
+class ToleranceTable(Result):
+    """The tolerances of a lens: `print(table)` shows them, `table[3]` is a row, `len(table)` their number.
 
     rows: `Tolerance`; an error of `perturbed` belongs to each, in this order.
     compensators: `Compensator`; test_wavelength: of fringes, µm.
@@ -83,7 +84,7 @@ class Tolerances(Result):
         every = torch.arange(len(self.rows))
         return limits.new_zeros(len(every), len(every)).index_put((self.leaders, every), limits)
 
-    def only(self, *kinds: str) -> "Tolerances":
+    def only(self, *kinds: str) -> "ToleranceTable":
         """The tolerances with the rows of these kinds alone."""
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.kind in kinds), saves=())
 
@@ -138,6 +139,10 @@ class Tolerances(Result):
         }
 
 
+#: Former name.
+Tolerances = ToleranceTable
+
+
 def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
     """The places of the rows of each group, in the order of its first row."""
     groups: dict[str | int, list[int]] = {}
@@ -146,9 +151,9 @@ def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
     return list(groups.values())
 
 
-def rows_of(tolerances: Tolerances | Iterable[Tolerance]) -> tuple[Tolerance, ...]:
+def rows_of(tolerances: ToleranceTable | Iterable[Tolerance]) -> tuple[Tolerance, ...]:
     """The rows of tolerances, or of a sequence of them."""
-    return tolerances.rows if isinstance(tolerances, Tolerances) else tuple(tolerances)
+    return tolerances.rows if isinstance(tolerances, ToleranceTable) else tuple(tolerances)
 
 
 def check_limits(row: Tolerance) -> None:
