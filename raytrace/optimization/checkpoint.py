@@ -43,11 +43,11 @@ _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "secon
 
 
 class BadCheckpoint(RaytraceError, ValueError):
-    """Not a checkpoint, or of another optimisation; the message says what was found and what was expected."""
+    """A file that is no checkpoint, or of another optimisation; the message compares found and expected."""
 
 
 class Stored(NamedTuple):
-    """Content of a checkpoint.
+    """The content of a checkpoint.
 
     x: the variables (n,); glasses: of surfaces where they vary, (catalog, name); tested: surfaces at which no exchange
     has helped since the last one; descent: None before it started; evaluated: of a merit that is not a sum of squares,
@@ -75,7 +75,7 @@ _LOG = dataclasses.replace(_CHECKPOINT, lost="the log ends here")
 class Checkpoint:
     """A file of the state of an optimisation, replaced as a whole.
 
-    {"of": what it depends on, "merit": …, "cycles": …, "variables": {name: number} of the last cycle, at the end of the
+    {"of": the dependencies, "merit": …, "cycles": …, "variables": {name: number} of the last cycle, at the end of the
     best lens, "descent": all that determines the next cycle}; with "glasses": {surface: [catalog, name]} and "tested"
     where glasses vary, and with "evaluated" in the place of "descent" for a merit that is not a sum of squares.
     """

@@ -3,7 +3,7 @@
 1. The lens is optimised with its glasses: later steps may not end worse.
 2. Variable glasses become model glasses, whose numbers (n, V, ΔP) stay within the convex hull of the catalogs. The
    lens is optimised with them.
-3. One element at a time, the one that loses most first, takes a glass of the catalogs.
+3. One element at a time takes a glass of the catalogs, first the one whose merit rises most by that.
 4. One glass at a time is exchanged, until no exchange lowers the merit.
 
 An expansion of the merit selects the glasses that are tried. With the derivatives J_y of the residuals r by all other
@@ -38,11 +38,11 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import GLASS
 
-_MATTERS = 1e-6  # of the index: what a number of a glass must change of it at the wavelengths, to vary
+_MATTERS = 1e-6  # smallest change of the index at the wavelengths by a number of a glass that varies
 
-#: Statuses that are chosen from; a merit counts so much more with a glass of another than the first.
+#: Statuses of glasses that are chosen, and the factor on the merit with such a glass.
 STATUSES = {"preferred": 1.0, "standard": 1.03, "": 1.03}
-_PRICE = 0.02  # the power of the price, relative to that of the catalog's cheapest sort, by which a merit counts more
+_PRICE = 0.02  # exponent of the relative price of a glass in the factor on the merit
 
 
 class Pool:
@@ -65,11 +65,11 @@ class Pool:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What varies of a model glass."""
+        """The numbers of a model glass that vary."""
         return tuple(GLASS)[: self.count]
 
     def numbers_of(self, glass: Glass) -> np.ndarray:
-        """(k,) of the model glass whose indices come nearest at the wavelengths; as many of them are met exactly."""
+        """Numbers (k,) of the model glass whose indices at the wavelengths are nearest, by least squares."""
         excess = refractive_index(glass, self.wavelengths).numpy() - 1
         coefficients = np.linalg.lstsq(self.basis, excess, rcond=None)[0]
         n, dispersion, deviation = np.pad(coefficients, (0, 3 - self.count))
@@ -98,9 +98,9 @@ def _basis(wavelengths: torch.Tensor) -> np.ndarray:
 
 
 def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The convex hull of points (G, k): normal (F, k) · p ≤ reach (F,), a length of 1 as large as all of them.
+    """The convex hull of points (G, k): normal (F, k) · p ≤ reach (F,), in units of the range of the points.
 
-    A box where they are too few, or in a plane.
+    A box where the points are too few, or in a plane.
     """
     low, size = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
     scaled = (points - low) / size
@@ -115,7 +115,7 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def catalogs_of(lens: Lens, catalog: Sequence[str | PathLike] = ()) -> tuple[Catalog, ...]:
-    """Catalogs by their names or AGF files; without any those that the lens names, else SCHOTT. Raises CatalogError."""
+    """Catalogs by name or AGF file; by default those of the lens, else SCHOTT. Raises CatalogError and NoProblem."""
     shipped = [name for name in lens.catalogs if name not in missing_catalogs([name])]
     catalogs = []
     for name in catalog or shipped or ("SCHOTT",):
@@ -143,7 +143,7 @@ def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
 
 
 def charge(glass: Glass) -> float:
-    """Factor on the merit of a glass that its maker does not prefer, or that is expensive."""
+    """Factor on the merit with a glass: above 1 if its maker does not prefer it, or if it is expensive."""
     price = next((numbers[0] for keyword, numbers in glass.records if keyword == "OD" and numbers), 0.0)
     return STATUSES.get(glass.status, max(STATUSES.values())) * max(price, 1.0) ** _PRICE
 
@@ -161,10 +161,10 @@ def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:
 TRIED, TRIAL_CYCLES = 4, 15
 _CYCLES = 100  # of a stage
 _ROUNDS = 3  # of exchanges through all elements
-_GAIN = 5e-3  # by which an exchange must make the merit less, as part of it
+_GAIN = 5e-3  # smallest relative reduction of the merit by an exchange
 _DAMPING = 1e-4  # of the variables that follow in the expansion
-_MET = 1e-5  # up to which a condition that is missed counts as met
-_ALIKE = 0.01  # of the width of the hull: glasses that are nearer are not both tried
+_MET = 1e-5  # violation up to which a condition counts as met
+_ALIKE = 0.01  # of the width of the hull: of two glasses that are nearer, one is tried
 
 #: Descriptions of the kinds of steps.
 WORDS = {
@@ -183,7 +183,7 @@ Trials: TypeAlias = tuple[tuple[str, float, float], ...]
 class GlassStep:
     """One step of the choice.
 
-    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the new glass, 0 and "" of the former two;
+    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the new glass, 0 and "" of "own" and "model";
     replaced: the glass before. predicted, reached: merits. tried: (name, predicted, reached) of all candidates that
     were optimised.
     """
@@ -251,9 +251,9 @@ class Expansion:
 
 
 def expansion(state: SumOfSquares, columns_of_glass: np.ndarray, following: np.ndarray, fixed: np.ndarray) -> Expansion:
-    """The merit by the variables `own` after `following` ones have followed, conditions met; numbers of columns.
+    """The merit by the numbers of a glass, with the `following` variables at their best and the conditions met.
 
-    fixed: (h', n) slopes of limits that are met just so, and stay met.
+    columns_of_glass, following: columns of the Jacobian. fixed: (h', n) slopes of active limits.
     """
     J, r = state.jacobian, state.residuals
     A, c = np.vstack([state.held_slope, fixed]), np.concatenate([state.held, np.zeros(len(fixed))])
@@ -299,7 +299,7 @@ class Choice:
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
-        """For every surface the glasses and their numbers: of the pool, and its own glass, if of a catalog."""
+        """The glasses and their numbers for every surface: the pool, and the glass of the surface, if of a catalog."""
         candidates = {}
         for k in self.surfaces:
             glass_of_lens, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
@@ -313,7 +313,7 @@ class Choice:
         return candidates
 
     def run(self, x: np.ndarray, stored: Stored | None = None) -> DescendedDesign:
-        """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
+        """The best design from variables x, which are within their bounds; stored: the state to resume."""
         glasses_of_lens = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
         if stored is not None and stored.glasses:
             chosen = glasses_of_lens | {k: self._named(k, *stored_glass) for k, stored_glass in stored.glasses.items()}
@@ -347,8 +347,10 @@ class Choice:
         self.keep(Stored(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
     def snapped(self, design: DescendedDesign, *, known: bool) -> DescendedDesign:
-        """The design with model glasses first, then with glasses of the catalogs in their places, one by one; as it is
-        where no time is left for that, and its glasses are known ones."""
+        """The design with model glasses, which glasses of the catalogs then replace one by one.
+
+        known: whether the glasses of the design are of catalogs; then it is returned where no time is left.
+        """
         first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
         design = self.descend(Design(design.x, model), self.surfaces, self.cycles)
         self.steps.append(GlassStep("model", design.merit, self.seconds))
@@ -364,7 +366,7 @@ class Choice:
         return time.monotonic() - self.started
 
     def problem(self, glasses: dict[int, Glass], open_: Sequence[int]) -> Problem:
-        """With these glasses; the numbers of those of surfaces `open_` vary behind the other variables."""
+        """The problem with these glasses; numbers of the glasses of surfaces `open_` are the last variables."""
         numbers = tuple(Vary(k, name) for k in open_ for name in self.pool.names)
         follow = tuple(
             Solve(k, name, "pickup", source=source)
@@ -417,7 +419,7 @@ class Choice:
         return DescendedDesign(end[:count], glasses, descent.state)
 
     def predicted(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
-        """For surfaces the predicted merits (G,) of their candidates; glasses of `open_` follow too."""
+        """The predicted merits (G,) of the candidates of surfaces; the glasses of `open_` follow as well."""
         models = {k: self.pool.model(self.numbers(design, k)) for k in self.surfaces}
         modelled = Design(design.x, models)
         x = self._start(modelled, self.surfaces)
@@ -441,7 +443,7 @@ class Choice:
     def tried(
         self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]
     ) -> tuple[DescendedDesign, Glass, float, Trials] | None:
-        """(design, glass, predicted merit, all that were tried) of the best of the promising candidates."""
+        """Design, glass and predicted merit of the best of the promising candidates, and all that were tried."""
         (glasses, numbers), current = self.candidates[surface], design.glasses[surface]
         width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
         candidates: list[int] = []  # none like another
@@ -465,7 +467,7 @@ class Choice:
         return (*best, tuple(tried)) if best else None
 
     def snap(self, design: Design, waiting: list[int]) -> DescendedDesign:
-        """The design in which the element that loses most by it has taken a glass of the catalogs."""
+        """The design with a glass of the catalogs in the element whose merit rises most by that."""
         merits = self.predicted(design, waiting, waiting)
         surface = max(waiting, key=lambda k: float(merits[k].min()))
         waiting.remove(surface)
@@ -476,7 +478,10 @@ class Choice:
         return end
 
     def swap(self, tested: Sequence[int] = ()) -> None:
-        """Exchange one glass at a time, the most promising first, until none helps; tested: where none has helped."""
+        """Exchange one glass at a time, the most promising first, until no exchange lowers the merit.
+
+        tested: surfaces at which no exchange lowers it.
+        """
         left_alone = set(tested)
         for _ in range(_ROUNDS * len(self.surfaces)):
             left = [k for k in self.surfaces if k not in left_alone]
@@ -490,7 +495,7 @@ class Choice:
             self._keep(left_alone)
 
     def _swap(self, surface: int, merits: np.ndarray) -> bool:
-        """Exchange a glass, if that helps."""
+        """Exchange a glass, if that lowers the merit."""
         design, before = self.best, self.best.glasses[surface]
         best = self.tried(design, surface, merits, ())
         if best is None:

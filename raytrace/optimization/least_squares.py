@@ -1,4 +1,4 @@
-"""Solvers: damped least squares under bounds and conditions, several descents of it, and L-BFGS-B for other functions.
+"""Solvers: damped least squares under bounds and conditions, descents with several dampings, and L-BFGS-B.
 
 Each cycle of `least_squares` takes the exact Jacobian J of the residuals r, scales variables by its columns and tries
 the step of the damped linear model, bent by the second derivative along it (geodesic acceleration). The ratio of the
@@ -134,7 +134,7 @@ class Linear:
         return _of_equalities(self.held[1], held)[0] / self.scale
 
     def step(self, damping: float, share: float = 1.0) -> np.ndarray:
-        """The step (n,); share: the part of the violation of equalities and limits that it removes. Raises NoStep."""
+        """The step (n,); share: part of the violation of equalities and limits that the step removes. Raises NoStep."""
         basis, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
         target = -basis[: len(self.start)].T @ self.start
         base, free = _of_equalities(self.held[1], -share * self.held[0])
@@ -333,7 +333,7 @@ Evaluate = Callable[[np.ndarray, bool], SumOfSquares]
 @dataclasses.dataclass(frozen=True)
 class SolverOptions:
     """damping: at the start; raised, lowered: factors, the latter the smallest; bends: with geodesic acceleration;
-    keeps: scales of variables never decrease. Each leads along its own path where there are several minima."""
+    keeps: scales of variables never decrease. Other options may lead to another minimum."""
 
     damping: float = 1e-3
     raised: float = 2.0
@@ -434,7 +434,7 @@ class _LeastSquares:
         return Descent(self.state, stopped, tuple(self.cycles), self.evaluations)
 
     def _cycle(self, number: int) -> str:
-        """One accepted step; the reason where none follows. Raises _OutOfTime."""
+        """Take one accepted step; the reason to stop, "" to continue. Raises _OutOfTime."""
         linear = self._linear()
         if self._is_flat(linear):
             return "gradient"
@@ -503,7 +503,7 @@ class _LeastSquares:
         return step + bend
 
     def _restored(self, linear: Linear, trial: SumOfSquares) -> SumOfSquares:
-        """Nonlinear equalities met again after the step."""
+        """The trial with nonlinear equalities met again after the step."""
         for _ in range(2):
             if np.abs(trial.held).max() <= _MET * max(np.abs(self.state.held).max(), 1e-3):
                 break
@@ -625,7 +625,7 @@ def best_of_paths(
     resume: PathProgress | None = None,
 ) -> BestDescent:
     """Descend from x within the bounds with the options of so many PATHS; cycles and seconds: of all of them together,
-    without either 500 cycles each.
+    by default 500 cycles each.
 
     watch: invoked after each cycle; resume: state of earlier paths: cycles count from their start.
     """
@@ -672,7 +672,7 @@ _STEPS = 15_000
 
 
 class NoOptimum(RaytraceWarning):
-    """A search ended where the error still falls; its last point is used."""
+    """A descent ended where the error still falls; its last point is used."""
 
 
 Slope: TypeAlias = tuple[float, np.ndarray]  # a value and its gradient

@@ -125,7 +125,7 @@ class DesignVariables:
         )
 
     def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
-        """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+        """The lens at variables (n,), or L lenses at (L, n), with solves and pickups.
 
         lens: the same lens in the dtype and on the device of the variables, if they differ.
 
@@ -167,21 +167,21 @@ def _with_picked_glasses(lens: Lens, variables: Sequence[Vary], solves: Sequence
 
 # -- a lens in one configuration ---------------------------------------------------------------------------------------
 
-#: Power of length of what a pickup between configurations adds.
+#: Power of length of the offset of a pickup between configurations.
 _POWERS = {"thickness": 1, "curvature": -1}
 
 
 class View:
-    """A lens in one configuration: what of it moves, and what stays."""
+    """A lens in one configuration: its numbers that move, and data that stay the same."""
 
     def __init__(self, model: DesignVariables, configuration: int, *, clips: bool = False) -> None:
-        """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
+        """clips: whether apertures clip rays; the rays of a merit function pass all apertures."""
         self.model, self.configuration = model, configuration
         lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
         if not clips:
             surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
             lens = dataclasses.replace(lens, surfaces=surfaces)
-        #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
+        #: Numbers that operands of the configurations set: they override variables and solves of the surface.
         operands = (operand for operand in lens.operands if operand.numbers is not None)
         overridden = {address for operand in operands for address, _ in addresses_of(lens, operand)}
         #: By address: the variable that a number follows, its factor and its offset.
@@ -208,7 +208,7 @@ class View:
         }
 
     def _is_idle(self, solve: Solve, lens: Lens) -> bool:
-        """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
+        """Whether a pickup follows a number that does not vary and is 0, because the lens does not model it."""
         addresses = [solve.address_of_source, solve.address]
         known = all(
             quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in addresses
@@ -217,12 +217,12 @@ class View:
 
     @cached_property
     def clipping(self) -> "View":
-        """The same with its apertures."""
+        """The view with its apertures."""
         return View(self.model, self.configuration, clips=True)
 
     @cached_property
     def waits(self) -> bool:
-        """Whether a solve waits for others that come later, or for the entrance pupil that it moves itself."""
+        """Whether a solve depends on later solves, or on the entrance pupil, which it moves itself."""
         solved = {solve.address: position for position, solve in enumerate(self.solves)}
 
         def is_late(position: int, solve: Solve) -> bool:
@@ -273,7 +273,7 @@ class View:
 
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:
-        """What moves of the media, by the surface in front of them: all of them with the air."""
+        """Addresses of the numbers that change each medium, by the surface in front of it."""
         air = [address for address in (TEMPERATURE, PRESSURE) if address in self.moved]
         moving: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
         for surface, quantity in self.moved:
@@ -316,7 +316,7 @@ class View:
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """Whether all of it is round about one axis."""
+        """Whether the lens is symmetric about its axis."""
         return is_round_about_axis(self.lens)
 
     @cached_property
@@ -335,7 +335,7 @@ class View:
         return not any(bool(tangents_of(power, len(others)).any()) for power in powers)
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
-        """The lens with other numbers."""
+        """The lens with these numbers instead of its own."""
         return with_numbers_of(self.lens, numbers, self.places)
 
     def table_of(
@@ -367,8 +367,7 @@ def stored_or_0(lens: Lens, address: Address) -> float:
 
 
 def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
-    """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
-    operands that pick up the number of another configuration."""
+    """Variable, factor and offset of the numbers of surfaces that operands move in a configuration, by address."""
     return {
         address: (number, place.factor * scale, place.factor * offset + place.offset)
         for operand, (number, scale, offset) in followed(model, configuration).items()
@@ -377,9 +376,9 @@ def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tu
 
 
 def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int, float, float]]:
-    """By operand that moves in a configuration: the variable that moves it, its factor and its offset.
+    """The variable, factor and offset of each operand that moves in a configuration.
 
-    A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
+    A pickup of another configuration is scale · (number there) + offset; the number there may be a pickup itself.
     """
     moved: dict[tuple[int | None, int], tuple[int, float, float]] = {
         (variable.operand, variable.configuration): (number, 1.0, 0.0)
@@ -405,7 +404,7 @@ def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int,
 
 
 def _with_glasses(solves: Sequence[Solve], variables: Iterable[Address]) -> list[Solve]:
-    """Pickups of glasses as pickups of each number that varies of the glass that is picked up."""
+    """The solves, with each pickup of a glass replaced by pickups of the numbers of that glass that vary."""
     moved, expanded = set(variables), []
     for solve in sorted(solves, key=lambda solve: solve.surface):
         if solve.quantity != "glass":
@@ -534,14 +533,15 @@ _CONVERGED = 5  # units of rounding
 _SLOPES = 1e-12  # relative to the largest derivative of a number
 _FREE = 1e-9  # |1 - ∂P/∂s| of solves that leave a number free
 
-#: What a state is made of; all else is computed of it.
+#: Attributes that define a state; all others are computed from them.
 _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 
 
 class LensState:
-    """view: `View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
+    """A view at given variables: numbers, first-order data and rays of the lens, with derivatives.
 
-    lens: of tensors, the lens of the view in their dtype and on their device.
+    variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1). lens: with
+    tensors, the lens of the view in their dtype and on their device.
     """
 
     def __init__(self, view: View, variables: Number, lens: Lens | None = None) -> None:
@@ -557,15 +557,15 @@ class LensState:
 
     @property
     def count(self) -> int:
-        """How many variables there are derivatives by; 0 where none are asked for."""
+        """The number of variables with derivatives; 0 of a state without derivatives."""
         return len(self.variables.slope) if isinstance(self.variables, Dual) else 0
 
     def fixed(self) -> "LensState":
-        """The same state without derivatives."""
+        """The state without derivatives."""
         return LensState(self.view, value_of(self.variables)) if self.count else self
 
     def number(self, surface: int, quantity: str) -> Number:
-        """A number of a surface, solved, picked up, varied or as it is stored."""
+        """A number of a surface: solved, picked up, varied or stored."""
         number = self.numbers.get((surface, quantity))
         return self.view.number((surface, quantity)) if number is None else number
 
@@ -783,7 +783,7 @@ class LensState:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all results of numbers that have changed."""
+        """Drop results that depend on changed numbers."""
         for name in vars(self).keys() - _GIVEN:
             del vars(self)[name]
         self._kept.clear()
@@ -864,7 +864,7 @@ def _tensor(number: Number) -> Tensor:
 
 
 def _is_settled(number: Number, before: Number) -> bool:
-    """Whether a number of a solve, with its derivatives, is that before a pass, but for rounding."""
+    """Whether a number of a solve and its derivatives are the same before and after a pass, to rounding."""
     a, b = value_of(number), value_of(before)
     if isinstance(a, Tensor):
         return not is_any((a != b) & ~((a - b).abs() <= _CONVERGED * torch.finfo(a.dtype).eps * a.abs()))
@@ -898,7 +898,7 @@ def _gaussian(state: LensState, wavelength: int) -> Gaussian:
 
 
 def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
-    """Where variables other than curvatures, thicknesses and glasses change the power of a surface."""
+    """System matrices where other variables than curvatures, thicknesses and glasses change the power of a surface."""
 
     def matrices(lens: Lens) -> list[Tensor]:
         wavelength_um = lens.wavelengths[wavelength]
@@ -1128,7 +1128,7 @@ class Bundle:
 
     @cached_property
     def _template(self) -> tuple[Sequence[Surface], Any, np.ndarray, Columns | None]:
-        """Surfaces, structure and table (W, K) as stored, and the columns of what moves (`_columns`)."""
+        """Surfaces, structure and table (W, K) as stored, and the columns of the numbers that move (`_columns`)."""
         view = self.view
         of_media = {address for addresses in view.glasses.values() for address in addresses}
         indices = torch.from_numpy(np.abs(view.indices))
@@ -1155,7 +1155,7 @@ class Bundle:
 
     @cached_property
     def is_expressible(self) -> bool:
-        """Whether the compiled trace has all the surfaces."""
+        """Whether the compiled trace supports all the surfaces."""
         return all(map(is_expressible, self.view.lens.surfaces[1 : self.last + 1]))
 
     @cached_property
@@ -1188,7 +1188,7 @@ class Bundle:
     # -- at a state ---------------------------------------------------------------------------------------------------
 
     def hits(self, state: LensState) -> Hits:
-        """All rays on surface `last`, in the order of `ask`; 0: in front of surface 1."""
+        """All rays on surface `last`, in the order of `ask`; in front of surface 1 if `last` is 0."""
         if self.last == 0:
             return self._at_object(state)
         if not self.is_expressible:
@@ -1336,7 +1336,7 @@ class Bundle:
 
     @cached_property
     def _last_aim(self) -> np.ndarray:
-        """The pupil points of the last aiming, where the next one starts."""
+        """The pupil points of the last aiming, from which the next aiming starts."""
         return self.pupil
 
     def _stop_radius(self, state: LensState) -> Number:

@@ -82,7 +82,7 @@ class Boundaries:
 
     @classmethod
     def of(cls, glass_thickness: Thicknesses, air_thickness: Thicknesses, edge: float | None) -> "Boundaries":
-        """From ranges, which may be text as "2:15", or "2" without a maximum. Raises ValueError."""
+        """The limits of ranges, or of their text: "2:15", or "2" without a maximum. Raises ValueError."""
         glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
         return cls(glass, air, edge)
 
@@ -273,10 +273,10 @@ class RowOptions(TypedDict):
 class Merit:
     """Rows of a merit function, in order; `rows[i - 1]` is row i.
 
-    unit: mm in the unit of length of targets and values, which matters beside rows of pure numbers or waves.
+    unit: mm in the unit of length of targets and values, by which lengths are weighted relative to numbers and waves.
     conventions: of operands whose meaning the file's program leaves open, as "opd_tilt=common" (`Conventions`);
-    skip_unknown: leave rows of unknown operands out. boundaries: those among the rows, between which `search`
-    spreads its starts. Raises ValueError for other conventions.
+    skip_unknown: leave rows of unknown operands out. boundaries: the boundaries among the rows, between which
+    `search` spreads its starts. Raises ValueError for other conventions.
     """
 
     rows: tuple[Row, ...] = ()
@@ -348,18 +348,18 @@ class Merit:
         return Merit(tuple(other)) + self
 
     def __mul__(self, factor: float) -> "Merit":
-        """With all weights larger."""
+        """The merit function with all weights multiplied by a factor."""
         rows = tuple(dataclasses.replace(row, weight=row.weight * factor) for row in self.rows)
         return dataclasses.replace(self, rows=rows)
 
     __rmul__ = __mul__
 
     def with_weights(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
-        """With other weights, by the number of a row or for all rows of an operand. Raises BadMerit."""
+        """The merit function with other weights, by number of a row or for all rows of an operand. Raises BadMerit."""
         return self._with(lambda row, weight: dataclasses.replace(row, weight=weight), by_row or {}, by_operand)
 
     def with_targets(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
-        """With other targets, by the number of a row or for all rows of an operand. Raises BadMerit."""
+        """The merit function with other targets, by number of a row or for all rows of an operand. Raises BadMerit."""
         return self._with(lambda row, target: dataclasses.replace(row, target=target), by_row or {}, by_operand)
 
     def _with(
@@ -394,9 +394,9 @@ def merit_for(
     merit: "Merit | DefaultMerit | Sequence[Row] | str | None" = None,
     configurations: Sequence[int] | None = None,
 ) -> Merit:
-    """A merit function as a value: as it is, of rows, of the settings or the name of a default one, or the file's.
+    """The `Merit` of a merit function: of rows, of the settings or kind of a default one, by default the file's.
 
-    configurations: those of the rows of a default one, from 1; by default all. Raises BadMerit.
+    configurations: of the rows of a default one, from 1; by default all. Raises BadMerit.
     """
     if merit is None:
         return Merit.of(lens)
@@ -440,13 +440,13 @@ def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
 
 
 def in_unit(row: Row, before: float, after: float) -> Row:
-    """The row with its target in another unit of length; both in mm."""
+    """The row with its target in another unit of length; before, after: the units in mm."""
     power = OPERANDS[row.operand].length if row.operand in OPERANDS else 0
     return dataclasses.replace(row, target=row.target * (before / after) ** power) if power else row
 
 
 def _moved(row: Row, by: int) -> Row:
-    """A row moved down with the rows that it refers to."""
+    """A row moved down by some rows, with its references to other rows."""
     operand = OPERANDS.get(row.operand)
     if operand is None or operand.refers is None:
         return row
@@ -552,9 +552,9 @@ class Evaluation:
             planner = planners[settings]
             self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
         self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
-        #: Rows that others take values of.
+        #: Rows whose values rows of arithmetic take.
         self.needed = frozenset(row for rows in referred.values() for row in rows)
-        #: Rows with a weight, and all that rows of arithmetic among them take values of.
+        #: Rows with a weight, and all rows whose values they take.
         self.counted: set[int] = set()
         left = [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
         while left:
@@ -578,7 +578,7 @@ class Evaluation:
                 yield (configuration, primary), line
 
     def _referred(self, placed: dict, skip_unknown: bool) -> tuple[dict[int, Sequence[int]], set[int]]:
-        """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
+        """The rows whose values each row of arithmetic takes, and the rows that cannot be evaluated."""
         referred, skipped = {}, set()
 
         def skip(line: Line, why: str, meant: str = "") -> None:
@@ -606,7 +606,7 @@ class Evaluation:
     ) -> Evaluated:
         """All rows at variables; derivatives: with the Jacobian, by some of the variables or, without `by`, all.
 
-        shown: also operands without a row that counts.
+        shown: with operands none of whose rows has a weight.
         """
         each = np.eye(len(variables))[slice(None) if by is None else list(by)]
         count = len(each)
@@ -674,9 +674,9 @@ class Evaluation:
 
 
 def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
-    """Rows of arithmetic, each after those that it takes values of. Raises Circle.
+    """Rows of arithmetic, each after the rows whose values it takes. Raises Circle.
 
-    referred: the rows whose values each takes, by its own number.
+    referred: these rows, by the number of the row of arithmetic.
     """
     try:
         return [row for row in TopologicalSorter(referred).static_order() if row in referred]

@@ -23,8 +23,8 @@ from raytrace.system.parameter_paths import APERTURE, GLASS_NUMBER, Address, Par
 class MeritOfBatch:
     """A merit function planned for a batch of lenses.
 
-    addresses: (surface, quantity) of the numbers that differ; numbers: (L, n) of them; by: which require a gradient.
-    Raises ValueError for a batch of temperatures or pressures, BadMerit and UnknownOperand as `evaluate`.
+    addresses: (surface, quantity) of the numbers that differ; numbers: (L, n) of them; by: places of those that require
+    a gradient. Raises ValueError for a batch of temperatures or pressures, BadMerit and UnknownOperand as `evaluate`.
     """
 
     def __init__(self, lens: Lens, function: Merit):

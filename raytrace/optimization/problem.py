@@ -7,13 +7,13 @@ operand by its arguments.
 Rows of positive weight are squared; rows of negative weight, and constraints, are conditions that are met exactly.
 
 Failed rays are charged by the amount by which each misses the surface at which it fails, with derivatives that lead it
-back. A ray that misses a conic has a negative discriminant; for one that is totally reflected the sine of refraction
-is above 1:
+back. A ray that misses a conic has a negative discriminant; for a totally reflected ray the sine of refraction is
+above 1:
 
     A t² + 2 B t + C = 0,  missed by A C - B²;    (n/n')² sin² I - 1
 
-Both are dimensionless and 0 where the ray just passes. At any other surface it is the distance of the ray beyond the
-vertex sphere, c² r².
+Both are dimensionless and 0 where the ray just passes. At other surfaces the amount is the distance of the ray beyond
+the vertex sphere, c² r².
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ class Condition:
     name: str = ""
 
 
-#: The arguments of a row: two whole numbers, four numbers.
+#: The arguments of a row: two integers and four numbers.
 Arguments = tuple[tuple[int, int], tuple[float, float, float, float]]
 
 _NONE: Arguments = ((0, 0), (0.0, 0.0, 0.0, 0.0))
@@ -127,7 +127,7 @@ def _condition(lens: Lens, word: str) -> Condition:
 
 
 def _arguments(text: str, word: str) -> Arguments:
-    """Arguments as in a row: two whole numbers, then up to four numbers."""
+    """The arguments of a row from text: two integers, then up to four numbers."""
     try:
         numbers = [float(part) for part in text.split(",") if part]
         first = [int(part) for part in numbers[:2]]
@@ -143,7 +143,7 @@ def _arguments(text: str, word: str) -> Arguments:
 
 
 def _behind_the_lens(lens: Lens) -> Arguments:
-    """From the last powered surface to the image."""
+    """The gaps from the last powered surface to the image."""
     bending = [k for k in range(1, sensor(lens) + 1) if has_power(lens, k)]
     return (max(bending, default=1), sensor(lens)), _NONE[1]
 
@@ -172,7 +172,7 @@ def _outer_colours(lens: Lens) -> Arguments:
     return (int(lens.wavelengths.argmin()) + 1, int(lens.wavelengths.argmax()) + 1), _NONE[1]
 
 
-#: Names of quantities in other programs, and the name here.
+#: Names of quantities in other programs, and their name in constraint syntax.
 _INSTEAD = {
     **dict.fromkeys(("bfl", "back_focal_length", "back_focal_distance"), "bfd"),
     **dict.fromkeys(("focal_length", "effective_focal_length", "efy"), "efl"),
@@ -225,7 +225,7 @@ class Recovery:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Amounts (K,) by which the rays of rows (K,), from 0, miss, by variables (K, n), and number of surfaces left.
 
-        0 of a ray along the surface, as behind a break of 90°: no derivative leads back.
+        The amount is 0 for a ray along the surface, as behind a break of 90°, which no derivative brings back.
         """
         variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
         missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
@@ -384,12 +384,12 @@ class Problem:
         self.recovery = Recovery(self.evaluation)
 
     def through(self, opening: float) -> "Problem":
-        """The same with rays through a part of the pupil and of the field alone, and without the lens as built."""
+        """The problem with rays through a part of pupil and field alone, and without the lens as built."""
         model = dataclasses.replace(self.model, opening=opening)
         return Problem(model, self.rows, self.conditions, **self._settings)
 
     def with_as_built(self, term: Expectation) -> "Problem":
-        """The same with the lens as built."""
+        """The problem with the lens as built as a term."""
         return Problem(self.model, self.rows, self.conditions, as_built=term, **self._settings)
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
@@ -442,15 +442,15 @@ class Problem:
 
     @cached_property
     def _share(self) -> float:
-        """The part of the rows that are no boundaries in the sum of the weights."""
+        """The share of the rows without boundaries in the sum of the weights."""
         weights = np.maximum(self.evaluation.weights, 0.0)
         free = [not (row.operand in OPERANDS and OPERANDS[row.operand].bounds) for row in self.evaluation.rows]
         return float(weights[free].sum() / weights.sum())
 
     def _charged(self, evaluated: Evaluated, x: np.ndarray, derivatives: bool) -> Evaluated:
-        """The charge for a failed ray raised the earlier it fails, and its miss as a further residual.
+        """The residuals with a charge for each failed ray, larger the earlier it fails, and its miss as a residual.
 
-        The former ranks two states; the latter alone has derivatives, which lead back.
+        The charge ranks two lenses; the miss has derivatives, which bring the ray back.
         """
         failed = evaluated.lost[evaluated.of_row]
         rows = np.unique(evaluated.of_row[failed])
@@ -470,7 +470,7 @@ class Problem:
         )
 
     def merit(self, evaluated: Evaluated, x: np.ndarray | None = None) -> float:
-        """M over the rows of the merit function alone; with x and the lens as built in addition."""
+        """M over the rows of the merit function; with x, the lens as built is added."""
         residuals = evaluated.residuals[evaluated.of_row < len(self.rows)]
         added = self._as_built(x, False)[0] if x is not None else np.zeros(0)
         return float(np.sqrt(residuals @ residuals + added @ added))
@@ -526,7 +526,8 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
 
 
 def typical_of(model: DesignVariables) -> np.ndarray:
-    """Large changes (n,) of the variables: for beams h wide h in thickness, 1/10h in curvature; or inf."""
+    """Large changes (n,) of the variables: h of thicknesses, 0.1/h of curvatures, h the radius of the beam; inf if
+    unknown."""
     state = model.views[model.lens.current_configuration - 1].state(model.start)
     h = 0.5 * float(state.entrance_pupil_diameter)
     typical = {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}

@@ -46,7 +46,7 @@ from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 
 _SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
-_NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, for second derivatives
+_NEAR = 0.01  # relative change of the residuals by a step along a variable, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
@@ -54,7 +54,7 @@ _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
 def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[int, ...]:
-    """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
+    """All surfaces before which a meniscus can be inserted, or the given ones, checked. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
         raise NoProblem("`insert`: the lens has several configurations; take one of them")
@@ -70,7 +70,7 @@ def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[in
 
 
 def _objection(free: DesignVariables, k: int) -> str:
-    """Why a surface takes no meniscus, "" where it does."""
+    """The reason why no meniscus can be inserted before a surface, "" where it can."""
     lens = free.lens
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
@@ -116,8 +116,10 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
 
 
 def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
-    """The rows with that part of the least thicknesses task of the new gaps, of 0 none; as many rows ahead of those
-    that are split off."""
+    """The rows with a part of the least thicknesses of the new gaps, without them if `part` is 0.
+
+    Rows that are split off come last.
+    """
     pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
     return (*(piece[0] for piece in pieces), *(row for piece in pieces for row in piece[1:]))
 
@@ -169,8 +171,8 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
 
 @dataclass(frozen=True)
 class Saddle:
-    """How the merit curves under its conditions. ways (n, m): a basis of the steps that break none, each of which
-    changes the residuals alike; slope (m,) and curves (m, m) of half the square of the merit along them."""
+    """Second order of the merit under its conditions. ways (n, m): a basis of the steps that keep the
+    conditions, each of which changes the residuals by the same amount; slope (m,) and curves (m, m) of half the square of the merit along them."""
 
     ways: np.ndarray
     slope: np.ndarray
@@ -178,12 +180,12 @@ class Saddle:
 
     @property
     def descent(self) -> np.ndarray:
-        """(n,) the way along which it falls most, to both sides."""
+        """The direction (n,) along which the merit falls most, to both sides."""
         return self.ways @ np.linalg.eigh(self.curves)[1][:, 0]
 
 
 def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
-    """How the merit curves at x (n,) where the variables `moves` (n,) move."""
+    """Second order of the merit at x (n,), by the variables `moves` (n,)."""
     state = problem.state(x, True)
     columns = np.sqrt((state.jacobian**2).sum(0))
     scale = np.where(columns > 0, columns, 1.0)
@@ -211,7 +213,7 @@ def _slope(state: SumOfSquares) -> np.ndarray:
 
 
 def _conditions(state: SumOfSquares, like: SumOfSquares | None = None) -> np.ndarray:
-    """Slopes (h, n) of what is held and of the limits that are reached, at the state `like`."""
+    """Slopes (h, n) of the equalities and of the limits that are active at the state `like`."""
     reached = (like or state).limits > -_ACTIVE
     return np.concatenate([state.held_slope, state.limits_slope[reached]])
 
@@ -232,7 +234,7 @@ class Place:
     task: SearchProblem
 
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
-        """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
+        """The descent with a part of the least thicknesses; with a part of 0 the new gaps stay at 0."""
         space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
         gaps = np.array(
             [variable.quantity == "thickness" and variable.surface in new for variable in self.task.model.variables]
@@ -244,7 +246,7 @@ class Place:
 
     @property
     def family(self) -> tuple:
-        """What lenses have in common whose variables can be compared."""
+        """Media, stop and variables: minima of lenses with the same ones can be compared."""
         lens = self.task.model.lens
         variables = tuple(variable.address for variable in self.task.model.variables)
         media = tuple((surface.glass.name, *surface.glass.coefficients.tolist()) for surface in lens.surfaces)
@@ -258,7 +260,7 @@ class Place:
         return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
 
     def displaced(self, stage: Stage, sign: float) -> np.ndarray:
-        """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
+        """Variables (n,) off the saddle to one side, as far as the merit falls, with the conditions met again."""
         x, problem = self.task.model.start, stage.problem
         way = saddle(problem, x, stage.moves(x)).descent
         way = sign * way / np.abs(way[np.argmax(np.abs(way))]) * np.sign(way[np.argmax(np.abs(way))])
@@ -274,7 +276,7 @@ class Place:
         return best
 
     def _met(self, stage: Stage, x: np.ndarray) -> np.ndarray:
-        """x with what is held met, by the shortest steps."""
+        """x with the equalities met, by the shortest steps."""
         x = np.clip(x, stage.lower, stage.upper)
         moves = stage.moves(x)
         for _ in range(_MEETINGS):
@@ -314,7 +316,7 @@ class Insertion:
         until = self.journal.until
         of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
         if not of_lens.is_valid:
-            raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
+            raise NoProblem("`insert`: the lens itself loses rays or violates `hold`; search without insert first")
         lens, work = model.lens_at(of_lens.x), of_lens.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:
@@ -345,6 +347,6 @@ class Insertion:
         return sum(end.seconds for end in ends)
 
     def each(self) -> list[tuple[Problem, Minimum]]:
-        """All minima, the best first, each with the problem that it is one of."""
+        """All minima, the best first, each with its problem."""
         minima = [(problem, minimum) for problem, distinct in self.families.values() for minimum in distinct.each]
         return sorted(minima, key=lambda pair: pair[1].result.merit)

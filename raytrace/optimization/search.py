@@ -182,7 +182,7 @@ class Searched(Result):
         folder.mkdir(parents=True, exist_ok=True)
         for number, lens in enumerate(self.lenses, 1):
             with warnings.catch_warnings():
-                if number > 1:  # what a file cannot hold is the same of all
+                if number > 1:  # the same warnings for every minimum
                     warnings.simplefilter("ignore", LensFileWarning)
                 write_lens(lens, folder / f"minimum_{number:02d}.zmx")
             thumbnail(lens, folder / f"minimum_{number:02d}.png")
@@ -308,7 +308,7 @@ def _draw_lens(axes: "Axes", lens: Lens) -> None:
 
 @style.styled
 def thumbnail(lens: Lens, path: str | PathLike) -> None:
-    """Write the cross section alone, small."""
+    """Write a small figure of the cross section."""
     figure = style.new_figure(3.0, 1.8)
     _draw_lens(figure.add_subplot(), lens)
     style.save(figure, path, dpi=80)
@@ -442,7 +442,7 @@ class _Run:
         return [(self.whole, minimum) for minimum in self.minima.each]
 
     def through(self, progress: Callable | None) -> None:
-        """All batches. Raises SearchStopped."""
+        """Run all batches. Raises SearchStopped."""
         bar = None if progress is None else progress(self.starts, "start")
         try:
             first = [_FIRST] if self.starts > _BATCH else []
@@ -512,7 +512,7 @@ class _Run:
 
 
 def _reversal(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
-    """The variable that each becomes in the reversed lens, and its sign; None where the reversal has others."""
+    """The variable that each variable becomes in the reversed lens, and its sign; None if the reversed lens has others."""
     lens = space.model.lens
     if not np.isfinite(float(lens.surfaces[0].thickness)):
         return None

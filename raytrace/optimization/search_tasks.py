@@ -163,7 +163,7 @@ class Minima:
     each: list[Minimum] = field(default_factory=list)
 
     def add(self, result: TaskResult, task: str, seconds: float) -> bool:
-        """Whether it is new, or better than the minimum that it equals."""
+        """Add a result; whether it is new, or better than the minimum that it equals."""
         if not result.is_valid:
             return False
         same = next((minimum for minimum in self.each if self._is_same(minimum.result, result)), None)
@@ -238,7 +238,7 @@ class Space:
         return self.model.views[self.model.lens.current_configuration - 1].state(x)
 
     def _focused(self, x: np.ndarray, focal_length: float) -> np.ndarray:
-        """x with all curvatures scaled by a factor, or else with the last curvature changed, for a focal length."""
+        """x for a focal length: with all curvatures scaled by a factor, or else with the last curvature changed."""
 
         def excess(x: np.ndarray) -> float:
             """Power beyond that of the focal length, in its units."""
@@ -336,7 +336,7 @@ def _ends(
 def length_of(
     model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition]
 ) -> float | None:
-    """The focal length in mm that is held, or the target of a row, or that of the lens; None where it has none."""
+    """The focal length in mm of `hold`, of the target of a row EFFL, or of the lens; None of an afocal lens."""
     for condition in conditions:
         if condition.row.operand == "EFFL":
             return abs(condition.row.target * unit)
@@ -381,7 +381,7 @@ class SearchProblem:
         return self.problem(self.rows)
 
     def problem(self, rows: Sequence[Row]) -> Problem:
-        """Of other rows."""
+        """The problem of other rows."""
         return Problem(self.model, rows, self.conditions, **self.settings)
 
     def about(self, seed: int) -> dict:

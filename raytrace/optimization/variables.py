@@ -56,7 +56,7 @@ from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_yo
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
 
-#: What a solve is called, for which number it may stand, and how many numbers it takes, least and most.
+#: Solves by name: the quantity that each sets, and the smallest and largest count of its numbers.
 SOLVED_BY = {
     "marginal_angle": ("curvature", 1, 1),
     "f_number": ("curvature", 1, 1),
@@ -70,7 +70,7 @@ _ALONE = ("sensor", *(name for _, name in OF_LENS))
 #: Numbers that belong to a medium.
 MEDIA = (*GLASS, "glass")
 
-#: What is not varied by that name, and what is instead.
+#: Names that are no variables, and the variable that is meant.
 _INSTEAD = {"radius": "curvature", "focus": "sensor", "glasses": "glass", "abbe": "abbe_number"}
 
 _NUMBER = r"\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?"
@@ -127,7 +127,7 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
 
 
 def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
-    """Of numbers; of a glass pickup all numbers of the glass; of a number of one configuration that configuration."""
+    """The addresses of numbers: all numbers of a glass that is picked up; with its configuration, if it has one."""
     addresses: set[tuple] = set()
     for moved in several:
         address, is_solve = moved.address, isinstance(moved, Solve)
@@ -150,7 +150,7 @@ def _spaces(lens: Lens, kind: str) -> str:
 
 
 def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
-    """The numbers that one word names, by surface and configuration. Raises BadVariables."""
+    """The variables that a word names, by surface and configuration. Raises BadVariables."""
     kind_of_surfaces, _, configurations = word.partition("@")
     kind, colon, numbers = kind_of_surfaces.partition(":")
     of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
@@ -193,7 +193,7 @@ def split_words(vary: str | Sequence[str]) -> list[str]:
 
 
 def name_of(variable: Vary) -> str:
-    """A variable as bounds and tables call it: thickness_6, in configuration 2 thickness_6@2, aperture."""
+    """The name of a variable in bounds and tables: thickness_6, in configuration 2 thickness_6@2, aperture."""
     if variable.address in OF_LENS:
         return variable.quantity
     return f"{variable.quantity}_{variable.surface}" + (f"@{variable.configuration}" if variable.configuration else "")
@@ -230,10 +230,10 @@ def bounds_of(
 
 
 def with_modelled(lens: Lens, moved: Sequence[Vary | Solve]) -> Lens:
-    """The lens with every such number modelled, at 0 where it was not, and glasses whose numbers move as model glasses.
+    """The lens with these numbers modelled, at 0 where they were not, and with model glasses where their numbers move.
 
-    Warns VariedGlass of the latter: between the lines of its definition a model glass is only near that of a catalog. A
-    lens whose temperature or pressure moves is in air of 20 °C and 1 atm if nothing else is given.
+    Warns VariedGlass of model glasses, which are only near the glass of a catalog between the lines of their
+    definition. A lens whose temperature or pressure moves is in air of 20 °C and 1 atm if nothing else is given.
     """
     if {number.address for number in moved} & {TEMPERATURE, PRESSURE}:
         lens = with_environment(lens, None, None)
@@ -266,7 +266,7 @@ def _model_of(glass: Glass, surface: int, lens: Lens) -> Glass:
 
 
 def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
-    """Whether a kind that is named alone means surface k too."""
+    """Whether a kind without surfaces, as "curvature", includes surface k."""
     surface = lens.surfaces[k]
     if kind == "curvature":
         return has_power(lens, k)
@@ -287,7 +287,7 @@ def has_power(lens: Lens, k: int) -> bool:
 
 
 def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
-    """The numbers of a surface that a kind stands for."""
+    """The numbers of a surface that belong to a kind, as tilt_x and tilt_y to "tilt"."""
     if kind == "thickness" and k == 0 and bool(torch.isfinite(lens.surfaces[0].thickness)):
         return [kind]
     last = sensor(lens) if kind in ("thickness", *MEDIA) else sensor(lens) + 1  # nothing is behind the image
@@ -309,7 +309,7 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 
 
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
-    """A number of a surface, or where it differs between the configurations one for each of them."""
+    """The variable of a number of a surface; where it differs between configurations, a variable for each of them."""
     for position, operand in enumerate(lens.operands):
         addresses = [address for address, _ in addresses_of(lens, operand)]
         if operand.numbers is not None and (k, quantity) in addresses:
@@ -322,10 +322,10 @@ def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
 
 
 def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[DesignVariables, tuple[int, ...]]:
-    """What varies but for glasses, and the surfaces whose glasses do.
+    """The design variables without "glass", and the surfaces whose glasses vary.
 
-    Those that the file marks, where words mean all; other numbers of those glasses vary no more. The file's variables
-    follow where words name nothing but glasses. Raises BadVariables.
+    Where a word means all glasses, those that the file marks vary, if it marks any. Other numbers of varied glasses do
+    not vary. The variables of the file vary where the words name glasses alone. Raises BadVariables.
     """
     chosen = {variable.surface for variable in free.variables if variable.quantity == "glass"}
     if not chosen:
@@ -344,7 +344,7 @@ def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[D
 
 
 def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
-    """The variables but for glasses, and for numbers of glasses that are chosen."""
+    """The variables without "glass" and without numbers of the chosen glasses."""
     of_media = (*MEDIA, *GLASS)
     return tuple(
         variable
@@ -354,7 +354,7 @@ def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
 
 
 def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[int]:
-    """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
+    """The surfaces whose glasses the file marks as exchangeable, of those that vary; all, if words name surfaces."""
     words = vary if isinstance(vary, str) else " ".join(word for word in vary or () if isinstance(word, str))
     kept = () if lens.optimization_data is None else lens.optimization_data.kept
     marked = {solve.surface for solve in kept if (solve.quantity, solve.kind) == ("glass", "substitute")}
@@ -363,7 +363,7 @@ def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[
 
 
 def followers(lens: Lens) -> dict[int, int]:
-    """Surfaces whose glass is that of another, and which one's."""
+    """Surfaces whose glass follows that of another surface, and that surface."""
     rules = () if lens.optimization_data is None else (*lens.optimization_data.solves, *lens.optimization_data.kept)
     return {
         rule.surface: rule.source
@@ -372,7 +372,7 @@ def followers(lens: Lens) -> dict[int, int]:
     }
 
 
-# -- what follows ------------------------------------------------------------------------------------------------------
+# -- solves and pickups ------------------------------------------------------------------------------------------------
 
 
 def _solves(lens: Lens, word: str) -> list[Solve]:
@@ -409,7 +409,7 @@ def _pickup(lens: Lens, word: str, k: int, quantity: str, parts: tuple) -> Solve
 
 
 def _arguments(word: str, solve: str, quantity: str, text: str) -> tuple[float, ...]:
-    """The numbers of a solve, if they are as many as it takes and it is one for that number of a surface."""
+    """The numbers of a solve. Raises BadVariables for another count of them, or a solve of another quantity."""
     solved, least, most = SOLVED_BY[solve]
     try:
         numbers = tuple(float(part) for part in text.split(",") if part)

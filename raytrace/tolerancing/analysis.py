@@ -1,4 +1,4 @@
-"""The lens as built: sensitivities, expectation and distribution, as a result with its table and figure."""
+"""Tolerance analysis: sensitivities, expectation and distribution of the lens as built, with table and figure."""
 
 import dataclasses
 import math
@@ -242,7 +242,7 @@ class ToleranceAnalysis(Result):
         return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
 
     def summary(self) -> dict[str, float]:
-        """Figures of the lens as built, in the unit of the criterion."""
+        """Numbers of the lens as built, in the unit of the criterion."""
         summary = {
             "nominal": float(self.nominal),
             "estimated": float(self.estimated),
@@ -370,7 +370,7 @@ class ToleranceAnalysis(Result):
 
 
 def _factor(new: Tolerance, old: Tolerance) -> float:
-    """How much narrower the limits of a row are."""
+    """The ratio of the new to the old range of a row."""
     wide = old.maximum - old.minimum
     return (new.maximum - new.minimum) / wide if wide else 1.0
 
@@ -401,9 +401,9 @@ def tolerance_analysis(
 ) -> ToleranceAnalysis:
     """The lens as built: sensitivities, expectation by second order and Monte Carlo.
 
-    A lens of several configurations is judged in all of them, by the mean of what the compensators minimise, by the
-    weights that its file gives them (CWGT), alike without.
-    `lens.configuration(2)` of a lens read alone: leave its others out by `operands=()`.
+    A lens of several configurations is judged in all of them: the compensators minimise the mean over the
+    configurations by the weights of the file (CWGT), equal by default. For `lens.configuration(2)` alone, remove the
+    others by `operands=()`.
 
     tolerances: as `tolerance_table` or `read_tolerances` return them; by default those of the lens's own file, or of
         `grade` and `limits`.
@@ -420,7 +420,7 @@ def tolerance_analysis(
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
-    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
+    goal: largest criterion of a good lens, of the MTF the smallest; the share of good lenses is reported.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
         least total tightness until this share reaches the goal, by second order corrected by traced lenses.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
@@ -433,7 +433,7 @@ def tolerance_analysis(
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
-    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
+    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study resumes.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.

@@ -41,7 +41,7 @@ _ANGLES = 45.0, 22.5
 
 
 class Unlit(BadTolerance, NoLight):
-    """A sample of lenses with one through which no ray of a field passes."""
+    """In a lens of the sample no ray of a field passes."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class AsBuilt:
 
 
 class AsBuiltTerm:
-    """The sample of errors for one lens, and what it gives for any lens of the same surfaces.
+    """The sample of errors of one lens, and the expectation of any lens with the same surfaces.
 
     Limits and semi-diameters, to which fringes and runouts refer, are those of this lens. Apertures clip no ray, as in
     a merit function.
@@ -108,7 +108,7 @@ class AsBuiltTerm:
         return f"{len(self.tolerances)} tolerances, {self.settings.words()}"
 
     def about(self) -> str:
-        """All that the term depends on besides the lens."""
+        """Everything on which the term depends besides the lens."""
         rows = [dataclasses.astuple(row) for row in (*self.tolerances, *self.tolerances.compensators)]
         numbers = [self.sampling.fields, self.sampling.field_weights, self.sampling.points, self.weights]
         return repr(
@@ -198,8 +198,7 @@ def design(tolerances: ToleranceTable) -> Tensor:
 
 
 def hadamard(least: int) -> np.ndarray:
-    """A Hadamard matrix of the smallest order from `least` that Paley's and Sylvester's constructions have; its first
-    column is 1."""
+    """A Hadamard matrix of the smallest order from `least` by Paley's and Sylvester's constructions, first column 1."""
     order = max(least, 1)
     while (matrix := _hadamard(order)) is None:
         order += 1

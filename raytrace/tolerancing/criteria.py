@@ -1,8 +1,8 @@
-"""Criteria: measures of image quality that a lens as built is judged by, of a batch of lenses in one pass.
+"""Criteria: measures of image quality of lenses as built, of a batch of lenses in one pass.
 
-A criterion f comes of a quantity q that the compensators minimise: f = √q where q is a mean square, f = 1 - q of the
-MTF. The mean square radius of spots is a parabola in the position of a plane sensor, whose minimum needs no second
-trace.
+A criterion f is a function of a quantity q that the compensators minimise: f = √q where q is a mean square, f = 1 - q
+of the MTF. The mean square radius of spots is a parabola in the position of a plane sensor, whose minimum needs no
+second trace.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ class Criterion:
     quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
     with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
     where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
-    derivatives. settings: what q depends on beyond lens, fields and pupil. angle: radians of a unit, 0 for no angle.
+    derivatives. settings: on which q depends besides lens, fields and pupil. angle: radians of a unit, 0 for no angle.
     allows_idle: whether compensators without effect on q stay at 0; else they are refused.
     """
 
@@ -124,7 +124,7 @@ def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
 
 
 def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
-    """Mean of tangential and sagittal MTF over the fields; q is what is missing to 1."""
+    """Mean of tangential and sagittal MTF over the fields; q = 1 - MTF."""
     pupils = ShearedPupils(lens, sampling.fields, frequency)
 
     def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
@@ -193,7 +193,7 @@ def _merit(lens: Lens, merit: Merit | DefaultMerit | Sequence[Row] | str | None)
     return Criterion("merit function", "", quantity, settings=(repr(rows.rows), rows.unit))
 
 
-#: Criteria of every lens by name, and those that are made of the nominal lens.
+#: Criteria of every lens by name; the others of NAMES depend on the nominal lens.
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),

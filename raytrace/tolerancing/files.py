@@ -1,4 +1,4 @@
-"""The tolerances of a lens file: those of its own lines."""
+"""The tolerances of a lens file, of its lines TOL."""
 
 from os import PathLike, fspath
 from pathlib import Path
@@ -33,6 +33,6 @@ _LINES = ("TOL", "TCMM")
 
 
 def tolerances_of(lens: Lens) -> ToleranceTable:
-    """The tolerances of the file that a lens comes from; none where it has no lines of them."""
+    """The tolerances of the file of a lens; an empty table where it has none."""
     lines = () if lens.optimization_data is None else lens.optimization_data.tolerances
     return ToleranceTable(*read_lines(lens, lines))

@@ -76,7 +76,7 @@ GRADES = {
 
 
 class Parts(NamedTuple):
-    """Where a lens has errors: its faces, glasses (surface in front, last surface of its group), gaps and elements.
+    """Parts of a lens that have errors: faces, glasses (surface in front, last surface of the group), gaps, elements.
 
     faces: surfaces where the light refracts or reflects; ends: the last face of every element of glass, whose wedge it
     has; gaps: surfaces in front of air between elements; units: cemented groups and single elements, which are mounted.
@@ -130,7 +130,7 @@ def _both(kind: str) -> tuple[str, ...]:
     return f"{kind}_x", f"{kind}_y"
 
 
-#: Words of limits that are no kinds, or have places of their own.
+#: Words of limits that are no kinds, or that apply to particular places.
 WORDS = {
     "radius": Word(("radius",), _faces, ("radius", "power", "curvature")),
     "power": Word(("power",), _faces, ("radius", "power", "curvature")),
@@ -171,7 +171,7 @@ def tolerance_table(
         the lens's own file.
     distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "parabolic" or "end_points", of rows
         that the file does not have.
-    compensators: what is adjusted after manufacture; by default those of the file for its own tolerances, of which
+    compensators: numbers adjusted after manufacture; by default those of the file for its own tolerances, of which
         there may be none, and the distance of the sensor for those of a grade or of limits alone.
 
     A thickness of glass is taken up by the first gap of air behind it. Raises BadTolerance.
@@ -246,7 +246,7 @@ def _parsed(text: str) -> list[_Limit]:
 
 
 def _word(name: str) -> Word:
-    """The word, or that of a kind."""
+    """The `Word` of a word of limits or of a kind."""
     if name in WORDS:
         return WORDS[name]
     whole = WORDS.get(name.removesuffix("_x").removesuffix("_y"))
@@ -297,7 +297,7 @@ def _curvature(lens: Lens, k: int) -> float:
 
 
 def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> list[Tolerance]:
-    """Rows whose radius may differ by more in fringes than by its part, in fringes; planes with them.
+    """The rows, with radii in fringes where the fringes of the grade are the larger limit, and with rows for planes.
 
     N fringes of λ/2 at the semi-diameter h are a part N λ |R|/h² of a radius R.
     """

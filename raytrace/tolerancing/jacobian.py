@@ -1,9 +1,8 @@
 """Derivatives of rays, merit functions, and any function of a lens by its design variables and its errors, in one pass.
 
-The lens is made of tensors that carry their derivatives (`maths.tangents`) by all variables, those that solves and
-pickups bring about included, and by all errors of manufacture, and the quantity is computed from it once, as without
-derivatives: by the compiled trace where that carries the rays, else by torch. Nothing is held fixed: rays are launched
-and aimed anew with every number.
+The numbers of the lens are tensors that carry their derivatives (`maths.tangents`) by all variables, through solves and
+pickups, and by all errors of manufacture. The quantity is computed from this lens once: by the compiled trace where it
+supports the surfaces, else by torch. Launch and ray aiming follow every number.
 """
 
 import dataclasses
@@ -180,7 +179,7 @@ def jacobian(
 def _perturbation(
     lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
 ) -> Perturbation | None:
-    """The lens with the errors that are asked for; None: with none."""
+    """The lens with the errors of tolerances, None without tolerances."""
     if tolerances is not None and (grade or limits):
         raise ValueError("jacobian: `tolerances` are given: leave `grade` and `limits` out")
     if tolerances is None and not (grade or limits):

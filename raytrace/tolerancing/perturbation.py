@@ -112,7 +112,7 @@ class Perturbation:
 def _gauges(
     lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]], wavelength: float, radii: Sequence[float] | None
 ) -> dict[int, Gauge]:
-    """What the errors of each surface are measured by; radii: the semi-diameters, where they are needed."""
+    """The references of the errors of each surface; radii: the semi-diameters, where they are needed."""
     angles: dict[int, Tensor] = {}
     for row, value in pairs:
         if row.kind == "irregularity_angle":
@@ -131,7 +131,7 @@ def _gauges(
 
 
 def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, gauges: dict[int, Gauge]) -> None:
-    """Change the number of a row; of a thickness, the adjusting one with it."""
+    """Change the number of a row, and with a thickness the adjusting thickness."""
     change = KINDS[row.kind].change
     if change is None:
         return
@@ -153,7 +153,7 @@ def raised(surface: Surface, quantity: str, change: Tensor) -> Surface:
 
 
 def path_of(nominal: Surface, quantity: str) -> ParameterPath | None:
-    """Where a surface holds a quantity; None: nowhere."""
+    """The path of a quantity of a surface, None if the surface does not have it."""
     if quantity == "thickness":
         return ParameterPath((quantity,))
     return parameter_paths(modelled(nominal, quantity)).get(quantity)
@@ -165,7 +165,7 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
     known: dict[tuple[int, str], Tensor | None] = {}
 
     def step(place: tuple[int, str]) -> Tensor | None:
-        """How much a number has changed; None: not at all."""
+        """The change of a number, None if it has not changed."""
         if place not in known:
             known[place] = None  # a number that follows itself stays
             known[place] = _solved(solves[place]) if place in solves else _difference(lens, surfaces, *place)
@@ -200,7 +200,7 @@ def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
 
 
 def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
-    """How much a number differs from that of the lens; None where it is the same tensor, or none."""
+    """The difference of a number from that of the lens; None where it is the same tensor, or not modelled."""
     path = path_of(lens.surfaces[k], quantity)
     if lens.surfaces[k] is surfaces[k] or path is None:
         return None
@@ -316,7 +316,7 @@ def _way(surfaces: Sequence[Surface]) -> list[Any]:
 
 
 def _single(poses: Sequence[Pose]) -> Pose | None:
-    """The pose of one alone, without the rounding of its angles."""
+    """The pose of a single one, whose angles then are not rounded; None of several."""
     return poses[0] if len(poses) == 1 else None
 
 
@@ -380,7 +380,7 @@ def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[in
     return tuple(operands)
 
 
-# -- what a lens does not have ----------------------------------------------------------------------------------------
+# -- checks ----------------------------------------------------------------------------------------
 
 
 def _named(row: Tolerance) -> str:
@@ -469,7 +469,7 @@ def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Sol
 
 
 def _objection(lens: Lens, row: Tolerance, surface: Surface) -> str:
-    """What the values of a lens forbid, in words, else ""."""
+    """The reason why the values of a lens do not allow a tolerance, "" where they do."""
     if row.kind == "radius" and (surface.curvature is None or not bool((surface.curvature != 0).any())):
         return "the surface is a plane, whose radius has no error; expected power (fringes) or curvature"
     if row.kind in ("index", "abbe") and (surface.is_mirror or is_air(surface.glass)):

@@ -1,8 +1,8 @@
 """Study: a criterion of a lens as a function of errors and compensators, its best compensators, and its second order.
 
-The criterion of a lens with errors e and compensators c is a function f(q), the root of a mean square q or what is
-missing of the MTF; the lens as built has the compensators that minimise q. Of one trial they come from Newton's method
-with the exact gradient and differences of gradients, all lenses of a batch at once.
+The criterion of a lens with errors e and compensators c is a function f(q): of a mean square q its root, of
+q = 1 - MTF the MTF. The lens as built has the compensators that minimise q. Newton's method finds them with the exact
+gradient and differences of gradients, for all lenses of a batch at once.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ _STEP = 0.05  # of the half width of a tolerance: step of the differences of gra
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_ALIKE = 1e-10  # of the curvatures, each by itself 1: the least one of compensators that differ
+_ALIKE = 1e-10  # smallest eigenvalue of the curvature matrix, scaled to a diagonal of 1, of compensators that differ
 _RINGS, _SAME = (4, 6, 8), 1e-4  # rings of the pupil that are tried, and the accepted relative error of q
 _CLIPPED = (4, 16), (6, 24), (8, 32), (8, 64), (12, 96)  # rings and arms where apertures clip beams; the last are exact
 #: Lenses traced at once.
@@ -205,7 +205,7 @@ class Study:
     def _acting(self, curvatures: Tensor, q: Tensor) -> Tensor:
         """Which compensators (C,) act on q; those without effect are refused, unless the criterion allows them.
 
-        Refused are also those that the nominal lens is no minimum of.
+        Compensators by which q of the nominal lens has no minimum are refused as well.
         """
         effect = 0.5 * curvatures * (_REACH * self.scale_of_compensators()) ** 2
         least, name = _NO_EFFECT * (float(q.min()) + self.criterion.scale), self.criterion.name
@@ -257,7 +257,7 @@ class Study:
 
 
 def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
-    """Whether the distance of the sensor is all that is adjusted, and the beams do not depend on it."""
+    """Whether the sensor distance is the only compensator, and the beams do not depend on it."""
     adjusted = [(compensator.surface, compensator.parameter, compensator.operand) for compensator in compensators]
     of_sensor = adjusted == [(sensor(lens), "thickness", None)]
     return of_sensor and lens.fields.kind != "real_image_height"

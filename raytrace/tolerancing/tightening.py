@@ -1,4 +1,4 @@
-"""Limits that are tightened: no error alone does more than a given harm, or a given share of the lenses is good.
+"""Tightening of limits: until no error alone exceeds a change of the criterion, or until a share of lenses is good.
 
 Inverse sensitivity: every limit t of a row is drawn in until the change of the criterion there, compensated and traced
 exactly, is the one given.
@@ -88,7 +88,7 @@ def limited_to_yield(
     others, checked = (draw_errors(tolerances, count, seed + k + 1) for k, count in enumerate((_OTHERS, _TRACED)))
 
     def good(s: Tensor) -> Tensor:
-        """Which traced lenses reach the goal."""
+        """Whether each traced lens reaches the goal."""
         return traced(s * checked.to(s)) <= goal
 
     def reached(s: Tensor) -> tuple[float, float]:

@@ -260,7 +260,7 @@ def _largest_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
 
 def _fields_of(line: Line, planner: Planner) -> list[tuple[float, float]]:
-    """The field of a row, or as many up to it as the number in the column of Hy counts with the axis."""
+    """The field of a row; with a number in the column of Hy so many fields from the axis to it, the axis left out."""
     x, y = field_of(planner, line.row.integers[0])
     last = max(round(line.row.numbers[1]) - 1, 1)
     return [(k / last * x, k / last * y) for k in range(1, last + 1)]

@@ -45,7 +45,7 @@ def _two(line: Line, rows: Sequence[Row]) -> list[int]:
 
 
 def _range(line: Line, rows: Sequence[Row]) -> list[int]:
-    """All between two that have a value; the ends may be text."""
+    """The numbers of all rows of a range that have a value; its ends may be text."""
     first, last = sorted(line.row.integers)
     if first < 1 or last > len(rows):
         raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}{_ADDED}")
@@ -107,7 +107,7 @@ def _below(row: Row, a: Number) -> Number:
 
 
 def _spread(row: Row, *values: Number) -> Number:
-    """target + Σ (|v - mean| - target) over those further from the mean than the target."""
+    """target + Σ (|v - mean| - target) over the values further from the mean than the target."""
     mean = sum(values) / len(values)
     return row.target + sum(np.maximum(np.abs(value - mean) - row.target, 0.0) for value in values)
 

@@ -2,7 +2,7 @@
 
 A row over several surfaces is its target if all of them comply, else less, or more, by the sum of their violations. Its
 error is 0, with zero derivatives, where the boundary is kept, and grows continuously where it is passed. Coordinate
-breaks are no surfaces here: a gap ends at the next surface that is none. A surface that closes before its semi-diameter
+breaks are skipped: a gap ends at the next other surface. A surface that closes before its semi-diameter
 has no edge: the difference is a violation of every row of edges, least or largest.
 
 The edge of a row is where OpticStudio has it, each surface at its own semi-diameter; where the last of its four numbers
@@ -47,7 +47,7 @@ class SemiDiameters:
 
     def __init__(self, planner: Planner):
         self.view, surfaces = planner.view, planner.lens.surfaces
-        #: mm, by surface, of those that do not follow the rays; the object's is 0 by default.
+        #: Semi-diameters in mm that do not follow the rays, by surface; that of the object is 0 by default.
         self.fixed = {0: surfaces[0].semi_diameter or 0.0} | fixed_semi_diameters(planner.lens)
         self.factors, self.lengths = np.array([semi_diameter_margin(planner.lens, k) for k in range(len(surfaces))]).T
         self.asked: set[int] = set()
@@ -59,7 +59,7 @@ class SemiDiameters:
 
     @once_a_context
     def at(self, context: EvaluationContext) -> Number:
-        """mm (S,) of all surfaces; nan of those without a row, and where no ray arrives."""
+        """Semi-diameters in mm (S,) of all surfaces; nan of surfaces without a row, and where no ray arrives."""
         sizes = np.full(len(self.factors), np.nan)
         slopes = np.zeros((context.state.count, len(sizes)))
         if follow := sorted(self.asked - set(self.fixed)):
@@ -102,7 +102,7 @@ class SemiDiameters:
 #: The point on the edge of a surface, by the code of a row: +y, +x, -y, -x.
 SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 
-#: What the code of a row at the common rim has in addition, and the numbers of such a row.
+#: Offset of the code of a row at the common rim, and the numbers of such a row.
 RIM, AT_RIM = len(SIDES), (0.0, 0.0, 0.0, 1.0)
 
 _EDGE = 1e-4  # of 1 - (1+k) c² s²: from where the root of a conic is continued
@@ -131,7 +131,7 @@ class Gaps:
 
     @once_a_context
     def centre(self, context: EvaluationContext) -> Number:
-        """mm on the axis, signed like the lens's."""
+        """Thickness in mm on the axis, signed as in the lens."""
         each: Number = context.state.of_surfaces("thickness")
         total = each
         start = np.arange(len(self.end))
@@ -142,17 +142,17 @@ class Gaps:
 
     @once_a_context
     def edge(self, context: EvaluationContext, code: int) -> Number:
-        """mm at the edge; code: the number of a side in `SIDES`, plus RIM at the common rim."""
+        """Thickness in mm at the edge; code: the number of a side in `SIDES`, plus RIM at the common rim."""
         return edge_thickness(self.centre(context), *self.sags(context, code))
 
     def whole(self, context: EvaluationContext, code: int) -> Number:
-        """mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
+        """Thickness in mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
         front, back = self.sags(context, code)
         return self.centre(context) + (np.maximum(back, 0.0) - np.minimum(front, 0.0))
 
     @once_a_context
     def sags(self, context: EvaluationContext, code: int) -> tuple[Number, Number]:
-        """mm (S,) of the surfaces on both sides of every gap, each at its own semi-diameter or both at the rim."""
+        """Sags in mm (S,) of the surfaces on both sides of every gap, at their own semi-diameters or at the rim."""
         sizes, every = self.semi_diameters.at(context), np.arange(len(self.end))
         if code < RIM:
             sags_there = self._sag(context, code, every, sizes)
@@ -162,7 +162,7 @@ class Gaps:
         return front, back
 
     def _sag(self, context: EvaluationContext, code: int, surfaces: np.ndarray, heights: Number) -> Number:
-        """mm (S,) of surfaces at heights (S,)."""
+        """Sag in mm (S,) of surfaces at heights (S,)."""
         state, (x, y) = context.state, SIDES[code]
         sag = self._even_sag(state, surfaces, heights)
         asked = np.flatnonzero(np.isin(surfaces, self.others) & ~np.isnan(value_of(heights)))
@@ -177,7 +177,7 @@ class Gaps:
 
     @once_a_context
     def shortfall(self, context: EvaluationContext) -> Number:
-        """mm by which surfaces fall short of their semi-diameters s, below 0 where they reach them: s (q - 1)/2.
+        """Length in mm by which surfaces fall short of their semi-diameters s, negative if they reach them: s (q - 1)/2.
 
         q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
         """
@@ -296,7 +296,7 @@ class _Places:
                 self.gaps.semi_diameters.ask(range(1, len(self.gaps.end)))
 
     def values(self, context: EvaluationContext) -> np.ndarray:
-        """Without derivatives."""
+        """The amounts (P,) without derivatives."""
         values = np.zeros(len(self.rows))
         for code in self.each:
             same = self.codes == code
@@ -304,7 +304,7 @@ class _Places:
         return values
 
     def at(self, context: EvaluationContext, places: np.ndarray) -> Number:
-        """Those of some places, with derivatives."""
+        """The amounts of some places, with derivatives."""
         numbers = np.zeros(len(places))
         for code in self.each:
             each = self.amount.number(self.gaps, context, code)[self.surfaces[places]]
@@ -313,7 +313,7 @@ class _Places:
 
 
 def _largest_violations(violated: np.ndarray, rows: np.ndarray, violations: np.ndarray) -> np.ndarray:
-    """Of every row the place of the largest violation."""
+    """The place of the largest violation of every row."""
     order = violated[np.argsort(-violations[violated], kind="stable")]
     return order[np.unique(rows[order], return_index=True)[1]]
 

@@ -105,7 +105,7 @@ class Pupil:
 
     @property
     def kind(self) -> tuple:
-        """Beams of one kind are evaluated together."""
+        """The kind of the beam; beams of one kind are evaluated together."""
         return self.layout.degree, self.layout.half, len(self.colours)
 
     def turned(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -346,7 +346,7 @@ def _entry(numbers: Callable[[EvaluationContext], Sequence | None], place: int =
 
 
 def _check(line: Line) -> None:
-    """Raises BadRow."""
+    """Check sampling and frequency. Raises BadRow."""
     if not 1 <= line.row.integers[0] <= 6:
         raise BadRow(line, f"has the sampling {line.row.integers[0]}: expected 1 to 6")
     if not line.row.numbers[1] > 0:
@@ -356,7 +356,7 @@ def _check(line: Line) -> None:
 
 
 def _strehl_ratio(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """Of one wavelength, or the mean of all by weight."""
+    """The Strehl ratio of one wavelength, or the weighted mean of all."""
 
     def row(line: Line) -> RowValue:
         field, colours = _field_number(line, planner), colours_of(line, planner)

@@ -155,9 +155,9 @@ class Operand:
 
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: description, with its arguments.
     length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
-    convention: the convention chosen where the field's own program leaves the meaning open.
+    convention: the convention chosen where OpticStudio leaves the meaning open.
     takes: the two integers of its rows, keys of `ARGUMENTS`; "" for one that is not read.
-    refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
+    refers: of an operand of arithmetic, the numbers of the rows whose values a row takes, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """
 
@@ -213,7 +213,7 @@ class Planner:
         surface: int | None = None,
         clips: bool = False,
     ) -> int:
-        """The number of any ray behind a surface, the image by default; clips: of those that apertures may stop."""
+        """The number of a ray behind a surface, the image by default; clips: whether apertures may stop it."""
         last = self.image if surface is None else surface
         if (last, clips) not in self.bundles:
             self.bundles[last, clips] = Bundle(self.view.clipping if clips else self.view, last)
@@ -276,14 +276,14 @@ def once_a_context(method: Callable[..., Shared]) -> Callable[..., Shared]:
 
 
 def known(valid: np.ndarray, number: Number) -> Number:
-    """nan where a ray is lost."""
+    """A number (R,) of rays, nan where a ray is lost."""
     if isinstance(number, Dual):
         return Dual(np.where(valid, value_of(number), np.nan), number.slope)
     return np.where(valid, number, np.nan)
 
 
 def per_row(numbers: Iterable[RowValue]) -> Evaluate:
-    """The values of rows that share nothing, by a function of the context each."""
+    """The values of rows that are computed one by one, each by its function of the context."""
     numbers = [*numbers]
     return lambda context: RowValues(listed([number(context) for number in numbers], context.state.count))
 
@@ -293,7 +293,7 @@ def per_row(numbers: Iterable[RowValue]) -> Evaluate:
 
 @dataclasses.dataclass(frozen=True)
 class Argument:
-    """What an integer names: in words, the smallest and the largest, and what a smallest of 0 means."""
+    """An integer of a row: the thing that it numbers, its smallest and largest value, and the meaning of 0."""
 
     word: str
     first: Callable[[Lens], int]
@@ -305,7 +305,7 @@ def _image(lens: Lens) -> int:
     return len(lens.surfaces) - 1
 
 
-#: By the names of `Operand.takes`.
+#: Kinds of integers, by the names of `Operand.takes`.
 ARGUMENTS = {
     "surface": Argument("surface", lambda lens: 0, _image, "the object"),
     "place": Argument("surface", lambda lens: int(is_at_infinity(lens)), _image, "the object, at a finite distance"),
@@ -410,7 +410,7 @@ class OrLost:
 
 
 class Operands(dict[str | Callable, Operand]):
-    """Operands by name; a function of a lens stands for itself."""
+    """Operands by name; the operand of a function of a lens is made from it."""
 
     def __contains__(self, operand: object) -> bool:
         return callable(operand) or super().__contains__(operand)

@@ -1,4 +1,4 @@
-"""Operands of rays: where they land, in which direction they go, and their angles to surface normals."""
+"""Operands of rays: landing points, directions, and angles to surface normals."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -49,7 +49,9 @@ class Sphere(NamedTuple):
 
 
 def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
-    """About where chief rays land, through the exit pupil of the primary wavelength; κ = 0 for one at infinity.
+    """Reference spheres about the image points of chief rays, through the exit pupil of the primary wavelength.
+
+    κ = 0 for a pupil at infinity.
 
         κ = D sign(v·d)/|v|,   v = D (C - E),   E_z = -n′ B/D - T
 
@@ -69,7 +71,7 @@ def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
 
 
 def _pupil_on_base_ray(wavelength: int) -> Callable[[Lens], Sequence[Tensor]]:
-    """Of a lens: where the base ray meets the image, its direction there, and the mean vergence 1/mm of the pupils."""
+    """A function of a lens: image point and direction of the base ray, and the mean vergence of the pupils in 1/mm."""
 
     def numbers(lens: Lens) -> Sequence[Tensor]:
         base = base_ray(lens, lens.wavelengths[wavelength])
