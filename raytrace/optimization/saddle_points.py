@@ -171,8 +171,11 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
 
 @dataclass(frozen=True)
 class Saddle:
-    """Second order of the merit under its conditions. ways (n, m): a basis of the steps that keep the
-    conditions, each of which changes the residuals by the same amount; slope (m,) and curves (m, m) of half the square of the merit along them."""
+    """Second order of the merit under its conditions.
+
+    ways (n, m): a basis of the steps that keep the conditions, each of which changes the residuals by the same amount;
+    slope (m,) and curves (m, m) of half the square of the merit along them.
+    """
 
     ways: np.ndarray
     slope: np.ndarray

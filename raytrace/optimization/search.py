@@ -512,7 +512,7 @@ class _Run:
 
 
 def _reversal(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
-    """The variable that each variable becomes in the reversed lens, and its sign; None if the reversed lens has others."""
+    """The variable that each becomes in the reversed lens, and its sign; None if the reversed lens has other ones."""
     lens = space.model.lens
     if not np.isfinite(float(lens.surfaces[0].thickness)):
         return None

@@ -177,7 +177,7 @@ class Gaps:
 
     @once_a_context
     def shortfall(self, context: EvaluationContext) -> Number:
-        """Length in mm by which surfaces fall short of their semi-diameters s, negative if they reach them: s (q - 1)/2.
+        """Length in mm by which surfaces fall short of their semi-diameters s, negative if not: s (q - 1)/2.
 
         q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
         """
