@@ -97,7 +97,9 @@ def flag(name: str) -> str:
     return f"--{SPELLED.get(name, name).replace('_', '-')}"
 
 
-def add_parameter(group, name: str, parameter: Parameter, row: Mapping, *, keep_default: bool = True) -> None:
+def add_parameter(
+    group, name: str, parameter: Parameter, row: Mapping, *, keep_default: bool = True
+) -> argparse.Action:
     """Add the option of a parameter: row, else the annotation and the docstring. Without the option the value is that
     of the default, or None; a help text that does not mention the default is completed by it."""
     settings = {
@@ -115,7 +117,7 @@ def add_parameter(group, name: str, parameter: Parameter, row: Mapping, *, keep_
         settings["dest"] = name
         if keep_default:
             settings["default"] = [*default] if isinstance(default, tuple) else default
-    group.add_argument(*flags, **{key: value for key, value in settings.items() if value is not None})
+    return group.add_argument(*flags, **{key: value for key, value in settings.items() if value is not None})
 
 
 def _shown(value: object) -> str:
