@@ -606,7 +606,7 @@ class LensState:
                 numbers[surface] = number
         return numbers
 
-    def index(self, wavelength: int) -> Sequence[Number] | np.ndarray:
+    def index(self, wavelength: int) -> Number:
         """Signed index behind every surface at a wavelength, counted from 0."""
         stored = self.view.indices[wavelength]
         if not self.view.glasses:
