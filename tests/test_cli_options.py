@@ -331,7 +331,7 @@ def test_axes_do_not_magnify_rounding(tmp_path):
 @pytest.mark.parametrize("command", [command.name for command in COMMANDS if command.verb in rt.PUBLIC])
 def test_parameters_read_from_the_source_are_those_of_the_function(command):
     verb = command.replace("-", "_")
-    expected, read = inspect.signature(getattr(rt, verb)).parameters, parameters_of(verb)
+    expected, read = inspect.signature(rt.public_name(verb)).parameters, parameters_of(verb)
     assert [*read] == [*expected]
     for name, parameter in read.items():
         if parameter.default is not None:  # one that is no constant in the source is not read

@@ -128,7 +128,7 @@ def _with_catalogs(arguments: argparse.Namespace, **paths: Path):
     from raytrace.cli.run import catalogs, options_of
 
     options = options_of(arguments) | paths | {"catalogs": catalogs(arguments)}
-    return getattr(raytrace, arguments.run.verb)(**options)
+    return raytrace.public_name(arguments.run.verb)(**options)
 
 
 def _check(arguments: argparse.Namespace):

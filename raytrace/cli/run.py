@@ -98,7 +98,7 @@ def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[floa
 def _takes(arguments: argparse.Namespace, keyword: str) -> bool:
     """Whether the command calls a public function with this parameter; codesign and bench call none."""
     verb = arguments.run.verb
-    parameters = inspect.signature(getattr(raytrace, verb)).parameters if verb in raytrace.PUBLIC else ()
+    parameters = inspect.signature(raytrace.public_name(verb)).parameters if verb in raytrace.PUBLIC else ()
     return keyword in parameters or ("execution" in parameters and keyword in _EXECUTION)
 
 
@@ -139,7 +139,7 @@ def result_of_lens(arguments: argparse.Namespace) -> Result:
                 from raytrace.optimization.merit import merit_of_options  # loads the package of merit functions
 
                 options["merit"] = merit_of_options(lens, **of_merit)
-        return getattr(raytrace, arguments.run.verb)(lens, **options)
+        return raytrace.public_name(arguments.run.verb)(lens, **options)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
 
