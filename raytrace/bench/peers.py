@@ -45,7 +45,7 @@ from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
 

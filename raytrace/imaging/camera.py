@@ -58,7 +58,7 @@ from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element

@@ -51,7 +51,7 @@ from raytrace.system.lens import Lens, with_object_distance, with_sensor_distanc
 from raytrace.system.parameter_paths import GLASS, parse_range
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers

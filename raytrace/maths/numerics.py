@@ -116,7 +116,7 @@ def dot(a: Iterable[Number], b: Iterable[Number]) -> Number:
     return torch.addcmul(ax * bx + ay * by, az, bz) if isinstance(az, Tensor) else ax * bx + ay * by + az * bz
 
 
-def dot_2(a: Tensor, b: Tensor) -> Tensor:
+def dot_2(a: Number, b: Number) -> Number:
     """Scalar product over a leading axis of length 2."""
     return a[0] * b[0] + a[1] * b[1]
 

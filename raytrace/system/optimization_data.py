@@ -28,6 +28,10 @@ class Vary:
     operand: int | None = None
     bounds: tuple[float, ...] = ()
 
+    @property
+    def address(self) -> tuple[int, str]:
+        return self.surface, self.quantity
+
     def __str__(self) -> str:
         within = f" from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else ""
         return f"{_where(self)}{within}"
@@ -73,6 +77,15 @@ class Solve:
     quantity_of_source: str = ""
     configuration: int = 0
     operand: int | None = None
+
+    @property
+    def address(self) -> tuple[int, str]:
+        return self.surface, self.quantity
+
+    @property
+    def address_of_source(self) -> tuple[int, str]:
+        """Of the number that a pickup follows."""
+        return self.source, self.quantity_of_source or self.quantity
 
     def __str__(self) -> str:
         if self.kind == "pickup" and self.operand is None:
