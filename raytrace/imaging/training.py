@@ -9,6 +9,7 @@ them. Only the first process writes.
 """
 
 import io
+import logging
 import math
 import time
 import warnings
@@ -26,6 +27,7 @@ from raytrace.stores import DamagedLine, Folder, Kind, Table, Unfit, anything, m
 from raytrace.tracing.compiled import prepare
 from raytrace.words import RaytraceError, calling_level
 
+_LOG = logging.getLogger(__name__)
 _MOST = 1 << 34  # bytes of a checkpoint
 _ANEW = "remove it to begin anew"
 
@@ -206,6 +208,7 @@ def train(
             # The log first: rows after a checkpoint are dropped on resuming, missing ones could not be restored.
             run.append(rows)
             run.save({"step": step, "module": module.state_dict(), "optimizer": optimizer.state_dict()})
+            _LOG.info("step %d of %d: loss %.6g", step, steps, summed)
             rows, saved_at = [], time.monotonic()
         yield step - 1, record
 

@@ -1,6 +1,7 @@
 """Optimising: the lens at a minimum of its merit function, from the lens as it is (`opening`, `least_squares`)."""
 
 import dataclasses
+import logging
 import os
 import time
 import warnings
@@ -40,6 +41,8 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
+
+_LOG = logging.getLogger(__name__)
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
@@ -245,6 +248,7 @@ class _Observer:
     def after_cycle(self, cycle: Cycle, x: np.ndarray, **state: Any) -> None:
         """state: of `Checkpoint.write`."""
         self.write(x, cycle.merit, cycle.number, **state)
+        _LOG.info("cycle %d: merit %.6g, step %.1e", cycle.number, cycle.merit, cycle.step)
         if self.log is not None:
             self.log.add(cycle)
         if self.bar is not None:

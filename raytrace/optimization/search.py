@@ -5,6 +5,7 @@ beam and then on the whole one; the best of a batch are followed to their minima
 drawn around the best minima so far. The decisions of a batch depend on earlier batches alone, never on the clock.
 """
 
+import logging
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -317,6 +318,7 @@ def thumbnail(lens: Lens, path: str | PathLike) -> None:
 # -- the search --------------------------------------------------------------------------------------------------------
 
 STARTS = 64
+_LOG = logging.getLogger(__name__)
 _BATCH = 16  # starts; what is done in a batch is shared by processes
 _FIRST = 4  # starts of the first batch of several: a limit of time passes after a minimum
 _POINTS = 8  # of which a start is the best
@@ -478,8 +480,12 @@ class _Run:
         ends = self._results([(key, partial(descended, x, stages, self.journal.until)) for key, x in tasks])
         self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
-            if self.minima.add(end, key, self.work) and bar is not None:
-                bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].result.merit:.6g}")
+            if not self.minima.add(end, key, self.work):
+                continue
+            words = f"{len(self.minima.each)} minima, the best {self.minima.each[0].result.merit:.6g}"
+            _LOG.info("%s: %s", key, words)
+            if bar is not None:
+                bar.set_postfix_str(words)
 
     def _start(self, number: int) -> TaskResult:
         """The lens as it is, or the best of some points between the bounds; both descended a little."""
