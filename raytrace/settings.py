@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 T = TypeVar("T")
 
@@ -60,7 +60,7 @@ class CodesignSettings(Settings):
     air_thickness: str = ""
     edge: float | None = None
     hold: str = ""
-    step: str = "sag"
+    step: Literal["sag", "blur"] = "sag"
     relearn: int = 0
     filters: str = "separate"
     start: str = "paraxial"
@@ -74,7 +74,7 @@ class CodesignSettings(Settings):
     fields: tuple[float, ...] = (0.0,)
     pixel: float = 0.005
     size: int = 21
-    normalise: str = "window"
+    normalise: Literal["window", "energy"] = "window"
     noise: float = 0.1
     network: str = "red-net"
     depth: int = 10
@@ -99,7 +99,7 @@ class CodesignSettings(Settings):
     limits: str = ""
     refocus: str = "sensor"
     cameras: int = 32
-    center: str = ""
+    center: Literal["", "chief", "centroid"] = ""
     sensor: tuple[float, ...] = ()
     response: str = "rgb"
     mosaic: str = "none"

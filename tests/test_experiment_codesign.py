@@ -331,7 +331,7 @@ def test_closed_forms_of_rows_begin_where_the_rows_do(lens, spectrum, monkeypatc
 
     def instantly(lens, settings, spectrum):
         begun.append((settings.model, settings.start))
-        return Optimum(settings.model, 57.8, 33.0, 19.0, 0.01, 0.01)
+        return Optimum(settings.model, 57.8, 33.0, 19.0, 0.01, 0.01, lens=lens)
 
     monkeypatch.setattr(study, "closed_form", instantly)
     rows = ("gaussian", AFTER_PARAXIAL)

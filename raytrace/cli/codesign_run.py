@@ -37,8 +37,9 @@ from raytrace.imaging.network import PRESETS, UNetShape
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import read_json, read_log
 from raytrace.io import FORMATS, read_lens, write_lens
+from raytrace.io.zemax import write as zemax
 from raytrace.maths.result import Column, Result, Table, plain
-from raytrace.plotting.style import FIELD_COLOURS, new_figure, styled
+from raytrace.plotting.style import FIELD_COLOURS, Figure, new_figure, styled
 from raytrace.settings import CodesignSettings
 from raytrace.settings import read as read_settings
 from raytrace.shards import processes, share
@@ -96,7 +97,7 @@ def open_experiment(
         check(initial)
     except ValueError as error:
         raise CommandError(f"{path}: {error}") from error
-    FORMATS[".zmx"].write(initial, str(path), catalogs=catalogs(arguments))  # refuses what the file cannot hold
+    zemax.write(initial, str(path), catalogs=catalogs(arguments))  # refuses what the file cannot hold
     least = settings.patch + settings.size - 1
     sensor = sensor_at_start(settings)
     colour = len(sensor.channels) == 3
@@ -129,11 +130,12 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
     """Settings from the options. stored: `settings.json` of a run, whose choice for precision "auto" is kept; None
     without training of a network."""
     preset = PRESETS[arguments.preset]
-    is_unet = isinstance(preset, UNetShape)
     options = {name: value for name, value in vars(arguments).items() if value is not None and value is not False}
-    shape = {"depth": preset.levels if is_unet else preset.depth, "width": preset.width}
+    if isinstance(preset, UNetShape):
+        network = {"network": "u-net", "depth": preset.levels, "width": preset.width}
+    else:
+        network = {"network": "red-net", "depth": preset.depth, "width": preset.width}
     given = given_settings(arguments, CodesignSettings)
-    network = {"network": "u-net" if is_unet else "red-net"} | shape
     options = network | _wavelengths(arguments, given) | given | options
     texts = ("vary", "bounds", "hold", "limits")
     options |= {name: " ".join(options[name]) for name in texts if isinstance(options.get(name), list)}
@@ -187,7 +189,7 @@ def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int =
 
     Processors without instructions for bfloat16 emulate it, ten times slower.
     """
-    trained = network_at_start(settings).to(memory_format=torch.channels_last)
+    trained = network_at_start(settings)
     sensor = sensor_at_start(settings)
     picture = torch.rand(count, len(sensor.channels), size, size)
     seconds = {}
@@ -198,7 +200,7 @@ def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int =
                 restored = trained(picture)
             restored.float().abs().mean().backward()
             seconds[name] = time.perf_counter() - start
-    return min(seconds, key=seconds.get)
+    return min(seconds, key=lambda name: seconds[name])
 
 
 def conjugates(lens: Lens, settings: CodesignSettings) -> tuple[list[float], list[float]]:
@@ -233,11 +235,12 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
 
     total = length + settings.epochs * per_epoch
     distances = np.linspace(settings.near, settings.far, _DISTANCES).tolist()
-    data = (experiment.train, experiment.test, settings, folder)
-    more = {"about": experiment.about, "distances": tuple(distances), "catalogs": experiment.catalogs}
-    more["device"] = experiment.device
+    steps = run_model(
+        experiment.lens, experiment.train, experiment.test, settings, folder, about=experiment.about,
+        distances=tuple(distances), catalogs=experiment.catalogs, device=experiment.device, progress=testing,
+    )  # fmt: skip
     try:
-        for name, step, record in run_model(experiment.lens, *data, **more, progress=testing):
+        for name, step, record in steps:
             if bar is None:
                 done = STEPS.index(name) * length + step
                 if done:
@@ -260,7 +263,9 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
             bar.close()
     if bar is None:
         say(f"{label}: finished before, nothing to train")
-    return outcome(folder)
+    result = outcome(folder)
+    assert result is not None  # the run ends by writing it
+    return result
 
 
 # -- results
@@ -275,7 +280,7 @@ class CodesignResult(Result):
     curves: dict[str, Sequence[float]]
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Every curve one after the other; noisy ones faint, with their running mean over a fiftieth of the curve."""
         figure = new_figure(5.6, 3.2)
         panel, start = figure.subplots(), 0
@@ -294,8 +299,8 @@ class CodesignResult(Result):
         return figure
 
     def document(self) -> dict:
-        limits = variables(self.experiment.lens, self.experiment.settings).limits
-        settings, limits = (dataclasses.asdict(values) for values in (self.experiment.settings, limits))
+        limits = dataclasses.asdict(variables(self.experiment.lens, self.experiment.settings).limits)
+        settings = dataclasses.asdict(self.experiment.settings)
         return plain({"settings": settings, **self.experiment.about, "limits": limits, **self.lens.document()})
 
     def tables(self) -> list[Table]:
@@ -308,8 +313,8 @@ class CodesignResult(Result):
                 f"  after step 1, with its own PSFs  {result.l1_joint:.5f}",
                 f"  the same network with DRT PSFs   {result.l1_before:.5f}",
                 f"  after step 2, with DRT PSFs      {result.l1_drt:.5f}",
-                *self._place_lines(),
-                *self._as_built_lines(),
+                *_place_lines(result),
+                *_as_built_lines(result, self.experiment.settings.as_built),
             ]
             distances = [float(z) / 1e3 for z in result.by_distance]
             losses = Column("L1 with DRT PSFs", form=".5f")
@@ -322,22 +327,6 @@ class CodesignResult(Result):
         errors = f"{result.error:.8f} with its own PSFs, {result.error_drt:.8f} with DRT PSFs"
         title = f"{result.model} PSFs, mean square error of a pixel behind the best linear filter"
         return [Table(course, [title], [*self._lens_lines(), f"error of this lens: {errors}"])]
-
-    def _place_lines(self) -> Iterator[str]:
-        if self.lens.l1_by_place:
-            yield "at shares of the half diagonal of the sensor, with DRT PSFs:"
-            for place, l1 in self.lens.l1_by_place.items():
-                behind = f"behind a Wiener filter of that place {self.lens.wiener_by_place[place]:.5f}"
-                yield f"  {float(place):4g}   {l1:.5f}, {behind}"
-
-    def _as_built_lines(self) -> Iterator[str]:
-        if count := len(self.lens.l1_as_built):
-            l1, psnr = (np.array([*errors.values()]) for errors in (self.lens.l1_as_built, self.lens.psnr_as_built))
-            training = "trained as built" if self.experiment.settings.as_built else "nominal training"
-            yield f"{count} perturbed cameras of no training, mean ± standard deviation ({training}):"
-            yield f"  L1                               {l1.mean():.5f} ± {l1.std():.5f}"
-            spread = f"{psnr.mean():.3f} ± {psnr.std():.3f} dB, least {psnr.min():.3f} dB"
-            yield f"  PSNR                             {spread}"
 
     def _lens_lines(self) -> Iterator[str]:
         result = self.lens
@@ -357,6 +346,24 @@ class CodesignResult(Result):
         )
         thicknesses = f"glass {glass}, its edge {limits.edge:.4g} at least, air {air} (mm)"
         yield f"penalty {result.penalty:.6g} mm², not part of the loss; thicknesses: {thicknesses}"
+
+
+def _place_lines(result: Outcome) -> Iterator[str]:
+    if result.l1_by_place:
+        yield "at shares of the half diagonal of the sensor, with DRT PSFs:"
+        for place, l1 in result.l1_by_place.items():
+            behind = f"behind a Wiener filter of that place {result.wiener_by_place[place]:.5f}"
+            yield f"  {float(place):4g}   {l1:.5f}, {behind}"
+
+
+def _as_built_lines(result: Outcome, as_built: bool) -> Iterator[str]:
+    if count := len(result.l1_as_built):
+        l1, psnr = (np.array([*errors.values()]) for errors in (result.l1_as_built, result.psnr_as_built))
+        training = "trained as built" if as_built else "nominal training"
+        yield f"{count} perturbed cameras of no training, mean ± standard deviation ({training}):"
+        yield f"  L1                               {l1.mean():.5f} ± {l1.std():.5f}"
+        spread = f"{psnr.mean():.3f} ± {psnr.std():.3f} dB, least {psnr.min():.3f} dB"
+        yield f"  PSNR                             {spread}"
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -382,7 +389,7 @@ def _train(arguments: argparse.Namespace) -> None:
     result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")
     if lens_file and not share().rank:
         write_lens(read_lens(folder / LENS, catalogs=experiment.catalogs), lens_file, catalogs=experiment.catalogs)
-    curves = {
+    curves: dict[str, Sequence[float]] = {
         f"step {k}": [row["loss"] for row in read_log(folder / name / "log.csv")] for k, name in enumerate(STEPS, 1)
     }
     _present(
@@ -404,7 +411,7 @@ def _spectral(arguments: argparse.Namespace) -> None:
         say(f"warning: {name} ends at a bound, and the loss still falls beyond it")
     result = CodesignResult(experiment, optimum, {"closed form": optimum.course})
     folder, lens_file = _outputs(arguments)
-    written = lens_file
+    written: object = lens_file
     if lens_file:
         write_lens(optimum.lens, lens_file, catalogs=experiment.catalogs)
     elif folder:

@@ -12,14 +12,16 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from raytrace.cli.parameters import Parameter, add_parameter
 from raytrace.cli.types import count, file_name, folder_name, seed_number
+from raytrace.settings import Settings
 from raytrace.words import RaytraceError, did_you_mean
 
 
 def option(
-    help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, between: str = " ", **spelling
+    help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, between: str = " ", **spelling: Any
 ) -> dict:
     """A row: help text and the arguments of argparse; name: if it is not that of the field; unit: of the option, in
     units of the field; between: numbers of a field of several. Without `type`, whole numbers are positive, other
@@ -34,7 +36,9 @@ def option(
 SEED = option("of random numbers", type=seed_number)
 
 
-def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: str, hidden: bool = False) -> None:
+def add_options(
+    group: argparse._ActionsContainer, defaults: Mapping, rows: Mapping[str, Mapping], *names: str, hidden: bool = False
+) -> None:
     """Add the options of these fields, of all rows if none are given. The parser stores None for a missing option.
 
     hidden: without a help text, for settings that a file gives.
@@ -58,7 +62,7 @@ class BadSettings(RaytraceError, ValueError):
     """A file of settings that cannot be read, or an entry that is no setting."""
 
 
-def settings_options(group, kind: type) -> None:
+def settings_options(group: argparse._ActionsContainer, kind: type) -> None:
     """--settings and --set."""
     group.add_argument(
         "--settings",
@@ -132,31 +136,40 @@ def _checked(kind: type, name: str, entry: object, where: str) -> object:
     kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     for wanted in kinds:
         origin = typing.get_origin(wanted) or wanted
-        if origin is tuple and isinstance(entry, Sequence) and not isinstance(entry, str):
+        if origin is typing.Literal:
+            if entry in typing.get_args(wanted):
+                return entry
+        elif origin is tuple and isinstance(entry, Sequence) and not isinstance(entry, str):
             if all(isinstance(number, int | float) for number in entry):
                 return tuple(map(float, entry))
         elif origin is float and isinstance(entry, int) and not isinstance(entry, bool):
             return float(entry)
         elif isinstance(entry, origin) and not (origin is int and isinstance(entry, bool)):
             return entry
-    expected = " or ".join(getattr(wanted, "__name__", str(wanted)) for wanted in kinds)
+    choices = [
+        f"{word!r}"
+        for wanted in kinds
+        if typing.get_origin(wanted) is typing.Literal
+        for word in typing.get_args(wanted)
+    ]
+    expected = " or ".join(choices or [getattr(wanted, "__name__", str(wanted)) for wanted in kinds])
     raise BadSettings(f"{where}: {name} = {entry!r}: expected {expected}")
 
 
-def words(settings, rows: Mapping[str, Mapping]) -> list[str]:
+def words(settings: Settings, rows: Mapping[str, Mapping]) -> list[str]:
     """The settings that differ from their defaults, as options of the command."""
-    defaults, found = defaults_of(type(settings)), []
+    defaults, options = defaults_of(type(settings)), []
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if field.name not in rows or value == defaults[field.name]:
             continue
         name, unit = _spelled(field.name, rows[field.name]), rows[field.name]["unit"]
         if value is True:
-            found.append(f"--{name}")
+            options.append(f"--{name}")
             continue
         between = rows[field.name]["between"]
-        found.append(f"--{name} {_text(value, between) if unit == 1 else f'{value / unit:.12g}'}")
-    return found
+        options.append(f"--{name} {_text(value, between) if unit == 1 else f'{value / unit:.12g}'}")
+    return options
 
 
 def defaults_of(kind: type) -> dict:
@@ -168,13 +181,15 @@ def _spelled(name: str, row: Mapping) -> str:
     return (row["name"] or name).replace("_", "-")
 
 
-def _text(value, between: str) -> str:
+def _text(value: object, between: str) -> str:
     if isinstance(value, tuple | list):
         return between.join(entry if isinstance(entry, str) else f"{entry:.12g}" for entry in value)
     return str(value)
 
 
-def picture_options(parser, content: str, *, limit: int | None = None):
+def picture_options(
+    parser: argparse.ArgumentParser, content: str, *, limit: int | None = None
+) -> argparse._ActionsContainer:
     """Add a group with --data and --limit, and return it; content: of the folder."""
     group = parser.add_argument_group("pictures")
     group.add_argument("--data", metavar="DIR", type=file_name, help=f"{content} (default: dead-leaves images)")
@@ -189,6 +204,6 @@ def picture_words(arguments: argparse.Namespace, limit: int) -> list[str]:
     return [*(["--data DIR"] if arguments.data else []), *limited]
 
 
-def documents(group, content: str) -> None:
+def documents(group: argparse._ActionsContainer, content: str) -> None:
     """--docs."""
     group.add_argument("--docs", metavar="DOCS", type=folder_name, help=f"folder of {content}")

@@ -1,5 +1,7 @@
 """Options that the subcommands of `raytrace wave` share, of the parameters of `rt.wave_psf`. No torch."""
 
+from typing import Any
+
 from raytrace.cli.options import Adder, catalog, group, option, parameters
 from raytrace.cli.types import file_name, positive, positive_finite
 
@@ -9,7 +11,7 @@ ELEMENTS = (
     "hybrid",
 )
 _MM = {"metavar": "MM"}
-_ROWS = {
+_ROWS: dict[str, dict[str, Any]] = {
     "aperture": {**_MM, "help": "diameter of the aperture"},
     "sensor": {**_MM, "help": "from element to sensor"},
     "exact": {"help": "true spheres instead of Fresnel's paraboloids, in design and PSF"},
@@ -44,12 +46,12 @@ _ROWS = {
 }  # fmt: skip
 
 
-def _of_wave_psf(title: str, *names: str, more: Adder | None = None, **defaults) -> Adder:
+def _of_wave_psf(title: str, *names: str, more: Adder | None = None, **defaults: Any) -> Adder:
     rows = {name: _ROWS[name] | ({"default": defaults[name]} if name in defaults else {}) for name in names}
     return group(title, parameters("wave_psf", *names, **rows), *([more] if more else []))
 
 
-def camera(*, exact: bool = True, **defaults: float) -> Adder:
+def camera(*, exact: bool = True, **defaults: Any) -> Adder:
     """--aperture, --sensor, --exact."""
     return _of_wave_psf("camera", "aperture", "sensor", *(["exact"] if exact else []), **defaults)
 
@@ -60,13 +62,13 @@ element = _of_wave_psf(
 )
 
 
-def light(**defaults: tuple[float, ...]) -> Adder:
+def light(**defaults: Any) -> Adder:
     """--depth, unless `depths` is empty, and --wavelength: the point sources."""
     names = ("wavelengths",) if defaults.get("depths") == () else ("depths", "wavelengths")
     return _of_wave_psf("light", *names, **defaults)
 
 
-def pixels(**defaults: float) -> Adder:
+def pixels(**defaults: Any) -> Adder:
     """--pixel, --size: the window of the PSF."""
     return _of_wave_psf("window", "pixel", "size", **defaults)
 

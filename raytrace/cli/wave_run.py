@@ -2,7 +2,8 @@
 
 import argparse
 import dataclasses
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -67,6 +68,7 @@ class DesignedElement(ElementReport):
 
     settings: DesignSettings
     errors: tuple[float, float]
+    initial: ElementReport = dataclasses.field(kw_only=True)
 
     def document(self) -> dict:
         inputs = {"settings": dataclasses.asdict(self.settings), "world": dataclasses.asdict(self.config)}
@@ -75,7 +77,9 @@ class DesignedElement(ElementReport):
         return plain(inputs | dataclasses.asdict(self.quality) | errors | before)
 
     def tables(self) -> list[Table]:
-        columns = {Column("object at"): [*map(depth_text, self.config.depths), "mean", "spread"]}
+        columns: dict[Column, Sequence] = {
+            Column("object at"): [*map(depth_text, self.config.depths), "mean", "spread"]
+        }
         for filter, heading in (("wiener", "Wiener"), ("blind", "invariant")):
             for rating, which in ((self.initial.quality, "initial"), (self.quality, "designed")):
                 values = *rating.by_depth[filter], rating.mean[filter], rating.spread[filter]
@@ -100,13 +104,13 @@ def design(arguments: argparse.Namespace) -> DesignedElement:
     camera = learn(settings, config, train, folder, label)
     pictures = {"train": periodic(train, WIDE), "test": periodic(test, WIDE)}
     with torch.no_grad():
-        parts, reports, errors = camera.variables(), [], []
+        parts, reports = camera.variables(), []
         for either in progress([camera.initial, parts], "element", what=f"{label}: image quality"):
             psf = kernels(either, config)
             reports.append(ElementReport(either, config, psf, quality(either, config, **pictures, psf=psf)))
-            errors.append(float(camera.expected(either)))
+        errors = float(camera.expected(camera.initial)), float(camera.expected(parts))
     initial, after = reports
-    designed = DesignedElement(parts, config, after.kernels, after.quality, settings, tuple(errors), initial=initial)
+    designed = DesignedElement(parts, config, after.kernels, after.quality, settings, errors, initial=initial)
     write_json(folder / "outcome.json", designed.document())
     heights = fabricated(parts[0]) if settings.kind == "rings" else as_pixels(parts[0], config.pixel)
     write_element(heights, folder / "heights.npy", design_wavelength=config.wavelengths[len(config.wavelengths) // 2])
@@ -164,8 +168,9 @@ def learn(settings: DesignSettings, config: WaveCameraConfig, train: Pictures, f
 
 def training_pictures(arguments: argparse.Namespace, leaves: str) -> Pictures:
     """Those of --data, else dead leaves by this name."""
-    options = {"size": WIDE // 2, "seed": arguments.seed or 0, "smallest": LEAVES[leaves]}
-    return pictures_of(arguments, WIDE // 2, lambda: dead_leaves(LEAF_COUNT, **options))[0]
+    seed, smallest = arguments.seed or 0, LEAVES[leaves]
+    drawn = functools.partial(dead_leaves, LEAF_COUNT, size=WIDE // 2, seed=seed, smallest=smallest)
+    return pictures_of(arguments, WIDE // 2, drawn)[0]
 
 
 # -- restoration

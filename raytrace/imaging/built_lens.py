@@ -42,17 +42,20 @@ def lens_as_built(lens: Lens, tolerances: Tolerances, errors: Tensor | Sequence[
 def sensor_compensator(lens: Lens, tolerances: Tolerances) -> Compensator | None:
     """The sensor distance as compensator; None where nothing is adjusted. Raises BadTolerance for another one."""
     last = len(lens.surfaces) - 2
-    for one in tolerances.compensators:
-        if (one.surface, one.parameter, one.operand) != (last, "thickness", None):
+    for compensator in tolerances.compensators:
+        if (compensator.surface, compensator.parameter, compensator.operand) != (last, "thickness", None):
             raise BadTolerance(
-                f"compensator {one}: a camera as built is adjusted by its sensor distance alone, the thickness of "
-                f"surface {last}; give tolerances(…, compensators=[Compensator({last})]), or compensators=() for none"
+                f"compensator {compensator}: a camera as built is adjusted by its sensor distance alone, the "
+                f"thickness of surface {last}; give tolerances(…, compensators=[Compensator({last})]), or "
+                "compensators=() for none"
             )
     return tolerances.compensators[0] if tolerances.compensators else None
 
 
 def _best_focus(lens: Lens, sampling: Sampling) -> Tensor:
     """Shift of the sensor (L,) mm, (1,) of a single lens, to the least mean square spot radius."""
-    _, covariance, variance = CRITERIA["rms"].parabola(aligned(lens, 3), sampling)
+    parabola = CRITERIA["rms"].parabola
+    assert parabola is not None
+    _, covariance, variance = parabola(aligned(lens, 3), sampling)
     along = along_normal(lens)
     return shift_to_focus(covariance, variance) / (along.reshape(-1) if isinstance(along, Tensor) else along)

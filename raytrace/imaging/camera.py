@@ -33,13 +33,14 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Literal, Self
+from typing import Any, Generic, Literal, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.field_kernels import (
+    Model,
     by_angle,
     check_model,
     check_points,
@@ -53,7 +54,7 @@ from raytrace.imaging.render import Rendering, element_in_stop, illumination_at,
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.result import plain
-from raytrace.psf_models import DRT, MODELS, Fourier, Gaussian, NotConverged, Paraxial, Wave, model_of, name_of
+from raytrace.psf_models import MODELS, NotConverged, model_of, name_of
 from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
@@ -64,10 +65,13 @@ from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
 from raytrace.words import named_value
 
+#: The variables of a camera: of a lens, or of a phase element without one.
+V = TypeVar("V", bound=Variables | PhaseVariables)
+
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
-class Camera(nn.Module):
+class Camera(nn.Module, Generic[V]):
     """Simulated capture and restoration of images in [0, 1], each at its own object distance and place.
 
     Images are (B, C, H, W), linear in light, of the C channels of the sensor's response; of one channel also (B, H, W),
@@ -96,16 +100,21 @@ class Camera(nn.Module):
     Warns UnfilledStop once, for the lens at construction.
     """
 
+    variables: V
+    element: PhaseVariables | None
+    network: nn.Module
+    psf_parameters: Model | None
+
     def __init__(
         self,
-        variables: Variables | PhaseVariables,
+        variables: V,
         network: nn.Module,
         *,
         sensor: Sensor | None = None,
         element: PhaseVariables | None = None,
         sensor_distance: float | None = None,
         wavelengths: Sequence[float] | None = None,
-        model: str | Paraxial | Fourier | Gaussian | DRT | Wave | None = None,
+        model: str | Model | None = None,
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
         pixels: int = 21,
@@ -187,7 +196,7 @@ class Camera(nn.Module):
             )
         if self.tolerances is None:
             return
-        if self.elements():
+        if self.elements() or not isinstance(self.variables, Variables):
             raise ValueError("tolerances of a camera with a phase element: expected a lens alone")
         if not MODELS[self.model].traces:
             raise ValueError(f"model {self.model!r} traces no rays of a lens as built; expected gaussian, drt or wave")
@@ -240,7 +249,9 @@ class Camera(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Does nothing: a state is compared before it is loaded."""
 
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, missing, *lists) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict, prefix: str, local_metadata: dict, strict: bool, missing: list[str], *lists: list[str]
+    ) -> None:
         stored = state_dict.get(prefix + KEY)
         if stored is not None:
             before, now = decoded_text(stored), self.description()
@@ -256,7 +267,7 @@ class Camera(nn.Module):
         """Rows and columns by which the PSF window shrinks an image."""
         return self.size - 1
 
-    def use(self, model: str | Paraxial | Fourier | Gaussian | DRT | Wave) -> None:
+    def use(self, model: str | Model) -> None:
         """Simulate with another PSF model, by its name or with its numbers."""
         if isinstance(model, str):
             self.model, self.psf_parameters = model, None if model not in MODELS else model_of(model)
@@ -279,12 +290,13 @@ class Camera(nn.Module):
         lens = self.lens()
         if self.tolerances is not None:
             lens = self.as_built(draw_errors(self.tolerances, len(distances)))
-        how = {"elements": self.elements(), "center": self.center, "parameters": self.psf_parameters}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
-            about = lens, self.sensor, self.model, self.fields, distances, self.size, self.tol
-            self._order = order_of(*about, **how)
+            self._order = order_of(
+                lens, self.sensor, self.model, self.fields, distances, self.size, self.tol,
+                elements=self.elements(), center=self.center, parameters=self.psf_parameters,
+            )  # fmt: skip
         return self._order
 
     def kernels(
@@ -339,9 +351,9 @@ class Camera(nn.Module):
             points = self.sensor.landing(lens, self._fields(field, count))
         if points is not None:
             warn_of_dark_places(kernels, points)
-        return (
-            kernels * illumination_at(lens, self.sensor, points)[:, None, None, None] if self.illumination else kernels
-        )
+        if self.illumination and points is not None:
+            kernels = kernels * illumination_at(lens, self.sensor, points)[:, None, None, None]
+        return kernels
 
     def _fields(self, field: int | Sequence[int], count: int) -> Tensor:
         """Field points (2, B) of one of the camera's fields, or of one for each of B images."""
@@ -414,7 +426,7 @@ class Camera(nn.Module):
             light = light[..., None, :, :]
         return light[None] if light.dim() == 3 else light
 
-    def render(self, scene: Tensor, depth: Tensor | None = None, **options) -> Rendering:
+    def render(self, scene: Tensor, depth: Tensor | None = None, **options: Any) -> Rendering:
         """The picture that the current lens projects onto the whole sensor, by the camera's PSF model: see `rt.render`.
 
         scene: (..., C, H, W) linear in light, of as many pixels as the sensor; depth: (H, W) mm; options: those of

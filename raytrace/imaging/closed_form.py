@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import TypedDict
 
 import scipy.optimize
 import torch
@@ -20,6 +21,7 @@ from raytrace.imaging.restoration import (
     kernel_error,
     power_spectrum,
 )
+from raytrace.imaging.variables import Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
@@ -44,7 +46,7 @@ def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int =
     A Hann window suppresses the borders of patches, which would look like texture. Of colour pictures (3, size, size),
     of their light; joint: their cross spectra (3, 3, size, size), see `cross_spectrum`.
     """
-    total = 0.0
+    total = torch.zeros(())
     count = crops * len(pictures)
     for sample in range(count):
         patch = torch.as_tensor(crop(pictures, sample, epoch=0, size=size, crops=crops, seed=seed)).to(torch.float64)
@@ -88,7 +90,7 @@ def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], dis
     distances = even_distances(camera) if distances is None else distances
     spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
-    transfer = transfer_functions(kernels, tuple(spectrum.shape[-2:]))
+    transfer = transfer_functions(kernels, spectrum.shape[-2:])
     if spectrum.dim() == 4:
         return joint_wiener(transfer, spectrum, noise_deviation(camera, spectrum))
     return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), noise_deviation(camera, spectrum))
@@ -119,7 +121,7 @@ class Course:
 
 
 def optimise_closed_form(
-    camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None, steps: int | None = None
+    camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None, steps: int | None = None
 ) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
@@ -136,13 +138,14 @@ def optimise_closed_form(
     bounds = []
     for variable in variables.variables:
         ends = variables.bounds.get(variable.name, (-math.inf, math.inf))
-        bounds.append(tuple(sorted((end - variable.start) / variable.unit for end in ends)))
+        low, high = sorted((end - variable.start) / variable.unit for end in ends)
+        bounds.append((low, high))
 
     def descend() -> TensorDescent:
         # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
         most = {} if steps is None else {"steps": steps}
-        how = {"unit": _FIRST_STEP, "bounds": bounds, "tolerance": 1e-11, **most}
-        return minimise_tensors(list(variables.parameters()), loss, **how)
+        parameters = list(variables.parameters())
+        return minimise_tensors(parameters, loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11, **most)
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.
@@ -153,20 +156,24 @@ def optimise_closed_form(
     ):
         descent = descend()
     names = tuple(variable.name for variable, at_end in zip(variables.variables, descent.at_end, strict=True) if at_end)
-    names += (variables.held.by.name,) if variables.beyond() else ()
+    names += (variables.held.by.name,) if variables.held is not None and variables.beyond() else ()
     if descent.is_flat:
         no_optimum = "no optimum: at the start of the search the loss does not change with the variables"
     elif names and ("sensor" in names or len(names) == len(variables.names)):
         # Without bounds of its own only a solved thickness has an end.
-        ends = [(name, *variables.bounds.get(name, (0.0, math.inf))) for name in names]
-        ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in ends)
+        ranges = ", ".join(
+            "{} from {:g} to {:g}".format(name, *variables.bounds.get(name, (0.0, math.inf))) for name in names
+        )
         no_optimum = f"no optimum inside {ranges}: the loss still falls at its end"
     else:
         no_optimum = out_of_focus(camera)
-    return Course(*zip(*parts, strict=True), names, no_optimum)
+    errors, penalties = zip(*parts, strict=True)
+    return Course(errors, penalties, names, no_optimum)
 
 
-def least_of_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> tuple[Course, float]:
+def least_of_closed_form(
+    camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None
+) -> tuple[Course, float]:
     """Minimise `camera_error` by two descents; returns the better one and the sensor distance reached by the first.
 
     The first starts at the camera's lens. The second starts at the minimum of a scan of sensor distances, evenly over
@@ -198,7 +205,7 @@ def least_of_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
 
 
 @torch.no_grad()
-def scan(camera: Camera, spectrum: Tensor, sensors: Sequence[float], distances: Tensor) -> list[float]:
+def scan(camera: Camera[Variables], spectrum: Tensor, sensors: Sequence[float], distances: Tensor) -> list[float]:
     """Closed-form error at each sensor distance in mm; the sensor is a variable, and is put back."""
     before, errors = copy.deepcopy(camera.variables.state_dict()), []
     for sensor in sensors:
@@ -209,12 +216,12 @@ def scan(camera: Camera, spectrum: Tensor, sensors: Sequence[float], distances: 
 
 
 @torch.no_grad()
-def _move_sensor(camera: Camera, sensor: float) -> None:
+def _move_sensor(camera: Camera[Variables], sensor: float) -> None:
     (variable,) = [variable for variable in camera.variables.variables if variable.name == "sensor"]
     camera.variables.get_parameter(variable.name).fill_((sensor - variable.start) / variable.unit)
 
 
-def out_of_focus(camera: Camera) -> str:
+def out_of_focus(camera: Camera[Variables]) -> str:
     """The reason why every object of the camera's range is out of focus on its sensor; "" if one is in focus."""
     low, high = _in_focus(camera)
     sensor = float(camera.variables().surfaces[-2].thickness.detach())
@@ -227,7 +234,7 @@ def out_of_focus(camera: Camera) -> str:
     )
 
 
-def _in_focus(camera: Camera) -> tuple[float, float]:
+def _in_focus(camera: Camera[Variables]) -> tuple[float, float]:
     """Sensor distances in mm at which an object of the range is in focus to the width of the PSF."""
     width = camera.sensor.pitch * camera.size
     return sensor_range(camera.variables(), camera.range, fields=camera.fields, width=width)
@@ -254,7 +261,15 @@ def distance_in_focus(lens: Lens, image_distance: Callable[[Lens], Tensor]) -> f
     return 1 / scipy.optimize.brentq(defocus, furthest, nearest, xtol=1e-14, rtol=1e-12)
 
 
-def focus_columns(lens: Lens) -> dict[str, float]:
+class FocusColumns(TypedDict):
+    """Sensor distance, mm, and object distances from vertex 1 in focus, m."""
+
+    sensor_mm: float
+    focus_paraxial_m: float
+    focus_rms_m: float
+
+
+def focus_columns(lens: Lens) -> FocusColumns:
     """Sensor distance, mm, and object distances from vertex 1 in focus, m: of paraxial rays and of least RMS spot."""
     paraxial = distance_in_focus(lens, lambda lens: paraxial_image_distance(lens, lens.surfaces[0].thickness))
     return {

@@ -12,9 +12,9 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ from raytrace.imaging.closed_form import (
     out_of_focus,
     patch_spectrum,
 )
+from raytrace.imaging.field_kernels import Model
 from raytrace.imaging.image import decoded
 from raytrace.imaging.network import RedNetShape, UNetShape, network
 from raytrace.imaging.pictures import Pictures, crop, draws
@@ -43,7 +44,7 @@ from raytrace.io import write_lens
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
-from raytrace.psf_models import DRT, Fourier, Gaussian, Paraxial, Wave, model_of
+from raytrace.psf_models import DRT, Paraxial, model_of
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
@@ -135,13 +136,12 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | 
 def sensor_at_start(settings: CodesignSettings) -> Sensor:
     """The sensor of an experiment, of whole pixels; without a size a grey one of a patch, with white noise alone."""
     if not settings.sensor:
-        side = settings.patch * settings.pixel
-        pixels = (settings.patch, settings.patch)
-        return Sensor(size=(side, side), pixels=pixels, read_noise=settings.noise, saturation=math.inf)
-    pixels = tuple(max(1, round(side / settings.pixel)) for side in settings.sensor)
+        side, count = settings.patch * settings.pixel, settings.patch
+        return Sensor(size=(side, side), pixels=(count, count), read_noise=settings.noise, saturation=math.inf)
+    columns, rows = (max(1, round(side / settings.pixel)) for side in settings.sensor)
     return Sensor(
-        size=tuple(count * settings.pixel for count in pixels),
-        pixels=pixels,
+        size=(columns * settings.pixel, rows * settings.pixel),
+        pixels=(columns, rows),
         response=settings.response,
         mosaic=settings.mosaic,
         full_well=settings.full_well,
@@ -151,15 +151,19 @@ def sensor_at_start(settings: CodesignSettings) -> Sensor:
 
 
 def network_at_start(settings: CodesignSettings) -> torch.nn.Module:
-    """The untrained network of an experiment, of as many channels as its sensor has. Raises ValueError."""
-    shapes = {"red-net": RedNetShape, "u-net": UNetShape}
+    """The untrained network of an experiment, of as many channels as its sensor has; its weights are channels_last.
+
+    Raises ValueError.
+    """
+    shapes: dict[str, type[RedNetShape] | type[UNetShape]] = {"red-net": RedNetShape, "u-net": UNetShape}
     if settings.network not in shapes:
         raise ValueError(f"network {settings.network!r}: expected {' or '.join(shapes)}")
     shape = shapes[settings.network](settings.depth, settings.width)
-    return network(shape, channels=len(sensor_at_start(settings).channels), seed=settings.seed)
+    untrained = network(shape, channels=len(sensor_at_start(settings).channels), seed=settings.seed)
+    return untrained.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's overloads
 
 
-def model_at(name: str, settings: CodesignSettings) -> Paraxial | Fourier | Gaussian | DRT | Wave:
+def model_at(name: str, settings: CodesignSettings) -> Model:
     """A PSF model with the numbers of an experiment: pupil points instead of `tol` where it has a number of rays."""
     rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
     if name == "paraxial":
@@ -168,13 +172,13 @@ def model_at(name: str, settings: CodesignSettings) -> Paraxial | Fourier | Gaus
     return model_of(name) if points is None else model_of(name, rays=points)
 
 
-def camera(lens: Lens, settings: CodesignSettings) -> Camera:
+def camera(lens: Lens, settings: CodesignSettings) -> Camera[Variables]:
     """The camera of an experiment at its start."""
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     return Camera(
         variables(lens, settings),
-        network_at_start(settings).to(memory_format=torch.channels_last),
+        network_at_start(settings),
         sensor=sensor_at_start(settings),
         model=model_at(settings.model, settings),
         object_distances=(settings.near, settings.far),
@@ -188,7 +192,9 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     )
 
 
-def with_catalog_glasses(trained: Camera, settings: CodesignSettings) -> tuple[Camera, CodesignSettings]:
+def with_catalog_glasses(
+    trained: Camera[Variables], settings: CodesignSettings
+) -> tuple[Camera[Variables], CodesignSettings]:
     """The camera with the nearest glasses of the catalogs, and the settings to train it again for `relearn` epochs.
 
     Its variables are the others, from their current numbers on; the network goes with it. Raises BadVariables where no
@@ -201,13 +207,13 @@ def with_catalog_glasses(trained: Camera, settings: CodesignSettings) -> tuple[C
     again = dataclasses.replace(
         settings, vary=" ".join(words), hold=hold, epochs=settings.relearn, start=repr(sensor), relearn=0
     )
-    one = camera(lens, again)
-    one.network.load_state_dict(trained.network.state_dict())
-    one.plan()
-    return one, again
+    with_glasses = camera(lens, again)
+    with_glasses.network.load_state_dict(trained.network.state_dict())
+    with_glasses.plan()
+    return with_glasses, again
 
 
-def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
+def freeze_lens(camera: Camera[Variables], settings: CodesignSettings) -> None:
     """Prepare step 2: a fixed lens and its DRT PSFs, over the whole pupil or of the `drt_rays`."""
     camera.variables.requires_grad_(False)
     points = pupil_points(settings.sampling, settings.drt_rays, seed=settings.seed)
@@ -264,10 +270,10 @@ def batch(
         patch = crop(pictures, sample, epoch=epoch, size=size, crops=settings.crops, seed=settings.seed)
         random = draws(settings.seed, epoch, sample, _SAMPLE)
         if settings.spread == "uniform":
-            distance = random.uniform(settings.near, settings.far)
+            z = random.uniform(settings.near, settings.far)
         else:
-            distance = 1 / random.uniform(1 / settings.far, 1 / settings.near)
-        parts.append((patch, distance))
+            z = 1 / random.uniform(1 / settings.far, 1 / settings.near)
+        parts.append((patch, z))
     picture, distance = (torch.as_tensor(np.stack(part)) for part in zip(*parts, strict=True))
     count, numbers, points, errors = len(pictures) * settings.crops, torch.tensor(samples), None, None
     index, sensor = epoch * count + numbers, sensor_at_start(settings)
@@ -318,14 +324,14 @@ class Batches:
         self.pictures, self.settings, self.tolerances = pictures, settings, tolerances
         self.steps_per_epoch = steps_per_epoch(pictures, settings)
         self._thread = ThreadPoolExecutor(1)
-        self._next: dict[tuple[int, Share], object] = {}
+        self._next: dict[tuple[int, Share], Future[Batch]] = {}
 
     def __call__(self, step: int, share: Share) -> Batch:
         ready = self._next.pop((step, share), None) or self._make(step, share)
         self._next = {(step + 1, share): self._make(step + 1, share)}
         return ready.result()
 
-    def _make(self, step: int, share: Share):
+    def _make(self, step: int, share: Share) -> Future[Batch]:
         epoch, place = divmod(step, self.steps_per_epoch)
         first = place * self.settings.batch
         samples = share.of(range(first, first + self.settings.batch))
@@ -345,13 +351,13 @@ def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor])
 
 
 def optimise(
-    camera: Camera, pictures: Pictures, settings: CodesignSettings, run: Run, *, every: int = 50
+    camera: Camera[Variables], pictures: Pictures, settings: CodesignSettings, run: Run, *, every: int = 50
 ) -> Iterator[tuple[int, Record]]:
     """The steps of one training, one at a time; variables of the lens that need no gradient are fixed."""
     batches = Batches(pictures, settings, camera.tolerances if settings.as_built else None)
     pixels = settings.batch * settings.patch**2
     optics = [p for p in camera.variables.parameters() if p.requires_grad]
-    groups = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
+    groups: list[dict[str, Any]] = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
     optimizer, steps = torch.optim.Adam(groups), settings.epochs * batches.steps_per_epoch
     rates = [group["lr"] for group in groups]
@@ -431,10 +437,12 @@ def errors_as_built(
     """
     count, pixels = len(pictures) * settings.crops, settings.patch**2
     samples = batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
+    if camera.tolerances is None:
+        raise ValueError("errors as built of a camera without tolerances: give as_built, grade or limits")
     drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_UNSEEN), []
     for number in progress(range(settings.cameras)):
-        one = dataclasses.replace(samples, errors=drawn[number])
-        sums = _summed(camera, one, lambda difference: difference.abs(), lambda difference: difference.square())
+        of_lens = dataclasses.replace(samples, errors=drawn[number])
+        sums = _summed(camera, of_lens, lambda difference: difference.abs(), lambda difference: difference.square())
         means.append([float(part.sum()) / (len(samples.field) * pixels) for part in sums])
     absolute, square = torch.tensor(means, dtype=torch.float64).unbind(-1)
     return absolute, psnr(square)
@@ -525,44 +533,39 @@ def run_model(
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
     for step, record in optimise(trained, train_pictures, settings, run(STEPS[1])):
         yield STEPS[1], step, record
-    optimised, built = trained.variables(), [{}, {}]
+    tested = functools.partial(held_out_error, trained, test_pictures, settings, progress=progress)
+    optimised, l1_as_built, psnr_as_built = trained.variables(), torch.empty(0), torch.empty(0)
     if trained.tolerances is not None:
-        found = errors_as_built(trained, test_pictures, settings, progress=progress)
-        built = [{str(number): error for number, error in enumerate(errors.tolist(), 1)} for errors in found]
-    of_places = {}
+        l1_as_built, psnr_as_built = errors_as_built(trained, test_pictures, settings, progress=progress)
+    l1_by_place, wiener_by_place = {}, {}
     if settings.sensor:
         filters = field_filters(trained, spectrum_of(train_pictures, settings), PLACES)
-        of_places = {
-            "l1_by_place": {
-                f"{place:g}": held_out_error(trained, test_pictures, settings, place=place, progress=progress)
-                for place in PLACES
-            },
-            "wiener_by_place": {
-                f"{place:g}": held_out_error(
-                    trained, test_pictures, settings, place=place, filters=filter, progress=progress
-                )
-                for place, filter in zip(PLACES, filters, strict=True)
-            },
-        }
+        for place, filter in zip(PLACES, filters, strict=True):
+            l1_by_place[f"{place:g}"] = tested(place=place)
+            wiener_by_place[f"{place:g}"] = tested(place=place, filters=filter)
     result = Outcome(
         model=settings.model,
         seed=settings.seed,
         l1_joint=l1_joint,
         l1_before=l1_before,
-        l1_drt=held_out_error(trained, test_pictures, settings, progress=progress),
+        l1_drt=tested(),
         **focus_columns(optimised),
         variables=trained.variables.numbers(),
         penalty=float(trained.variables.violation().detach()),
         no_optimum=out_of_focus(trained),
-        l1_as_built=built[0],
-        psnr_as_built=built[1],
-        **of_places,
-        by_distance={
-            f"{d:g}": held_out_error(trained, test_pictures, settings, distance=d, progress=progress) for d in distances
-        },
+        l1_as_built=_by_number(l1_as_built),
+        psnr_as_built=_by_number(psnr_as_built),
+        l1_by_place=l1_by_place,
+        wiener_by_place=wiener_by_place,
+        by_distance={f"{distance:g}": tested(distance=distance) for distance in distances},
     )
     write_lens(optimised, folder / LENS, catalogs=catalogs)
     write_outcome(result, folder)
+
+
+def _by_number(figures: Tensor) -> dict[str, float]:
+    """Figures (C,) of perturbed cameras by their number, from 1."""
+    return {str(number): figure for number, figure in enumerate(figures.tolist(), 1)}
 
 
 def write_outcome(result: Outcome, folder: Path) -> None:
@@ -613,7 +616,7 @@ class Optimum:
     course: tuple[float, ...] = ()
     penalties: tuple[float, ...] = ()
     at_end: tuple[str, ...] = ()
-    lens: Lens | None = None
+    lens: Lens = dataclasses.field(kw_only=True)
 
     def document(self) -> dict:
         """All but the lens."""
@@ -623,7 +626,7 @@ class Optimum:
 OPTIMUM_COLUMNS = tuple(field.name for field in dataclasses.fields(Optimum))[:9]
 
 
-def to_closed_form(trained: Camera, settings: CodesignSettings, spectrum: Tensor) -> Course:
+def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spectrum: Tensor) -> Course:
     """Move the lens of a camera to the closed-form optimum that `start` specifies: of its model, or of Gaussian DRT."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
     first = camera(trained.variables.lens, dataclasses.replace(settings, model=model))

@@ -12,7 +12,7 @@ further limit, with a derivative, where images have none.
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class GlassLimits:
 
     def __call__(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
         numbers = self.numbers(x)
-        excess = np.concatenate([self.pool.normal @ one - self.pool.reach for one in numbers.values()])
+        excess = np.concatenate([self.pool.normal @ glass - self.pool.reach for glass in numbers.values()])
         if not derivatives:
             return excess, None
         slope = np.zeros((len(numbers), len(self.pool.reach), len(x)))
@@ -71,9 +71,9 @@ class GlassLimits:
         """The catalog glass behind each surface whose numbers are nearest, in units of the spread of the catalogs."""
         width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
         distance = {
-            surface: (((self.pool.numbers - one) / width) ** 2).sum(1) for surface, one in self.numbers(x).items()
+            surface: (((self.pool.numbers - glass) / width) ** 2).sum(1) for surface, glass in self.numbers(x).items()
         }
-        return {surface: self.pool.glasses[int(np.argmin(one))] for surface, one in distance.items()}
+        return {surface: self.pool.glasses[int(np.argmin(squares))] for surface, squares in distance.items()}
 
 
 def joined_limits(limits: Sequence[Limits]) -> Limits | None:
@@ -82,7 +82,7 @@ def joined_limits(limits: Sequence[Limits]) -> Limits | None:
         return None
 
     def joined(x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        excess, slopes = zip(*(one(x, derivatives) for one in limits), strict=True)
+        excess, slopes = zip(*(limit(x, derivatives) for limit in limits), strict=True)
         return np.concatenate(excess), np.concatenate(slopes) if derivatives else None
 
     return joined
@@ -196,7 +196,7 @@ class Constraints:
         violation = _violation(state)
         beyond = f"conditions are violated by up to {violation:.3g}" if violation > EXACT else ""
         if words := " and ".join(filter(None, (beyond, lost))):
-            held = ", ".join(f"{one.name}{one.relation}{one.row.target:g}" for one in self.conditions)
+            held = ", ".join(f"{c.name}{c.relation}{c.row.target:g}" for c in self.conditions)
             advice = "vary more numbers, widen the bounds or take smaller steps"
             warnings.warn(f"constraints {held or 'of the lens'}: {words}; {advice}", NotReached, calling_level())
 
@@ -205,7 +205,7 @@ def _violation(state: SumOfSquares) -> float:
     return float(max(np.abs(state.held).max(initial=0.0), state.limits.max(initial=0.0)))
 
 
-def _rays(lens: Lens):
+def _rays(lens: Lens) -> Iterator[Row]:
     """A row for each ray of every field whose failure is brought back; their values do not count."""
     image = len(lens.surfaces) - 1
     x, y = lens.fields.x.detach(), lens.fields.y.detach()

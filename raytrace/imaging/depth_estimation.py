@@ -77,5 +77,5 @@ def most_likely(
 
     contrasts: (C,) factors of the spectrum, of which the most likely one counts.
     """
-    found = [log_likelihoods(periodograms, blurred_spectra(transfer, c * spectrum, sigma)) for c in contrasts.unbind()]
-    return torch.stack(found).amax(0).argmax(1)
+    spectra = (blurred_spectra(transfer, contrast * spectrum, sigma) for contrast in contrasts.unbind())
+    return torch.stack([log_likelihoods(periodograms, part) for part in spectra]).amax(0).argmax(1)

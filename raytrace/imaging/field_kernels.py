@@ -17,7 +17,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -27,7 +27,18 @@ from raytrace.imaging.sensor import Sensor
 from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
-from raytrace.psf_models import MODELS, Execution, NotConverged, model_of, psf
+from raytrace.psf_models import (
+    DRT,
+    MODELS,
+    Execution,
+    Fourier,
+    Gaussian,
+    NotConverged,
+    Paraxial,
+    Wave,
+    model_of,
+    psf,
+)
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.psf_models.models import is_sampled_in_common
 from raytrace.system.lens import Lens, is_round_about_axis, one_lens, with_field_kind, with_object_distance
@@ -43,6 +54,9 @@ from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+
+#: A PSF model with its numbers.
+Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
 #: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
@@ -87,12 +101,12 @@ class FieldKernels:
     lateral_colour: bool = True
     nodes: int = 33
     elements: tuple[Element, ...] = ()
-    parameters: object = None
+    parameters: Model | None = None
     center: Literal["chief", "centroid"] = "chief"
     normalise: Literal["window", "energy"] = "window"
     memo: Memo | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_model(self.model, self.elements)
 
     def at(self, points: Tensor) -> Tensor:
@@ -150,7 +164,7 @@ class FieldKernels:
         if len(distances) == 1:
             return kernels._of_one_distance(points)[:, 0]
         pairs = zip(distances.split(1), points.split(1, 1), strict=True)  # each with its own derivative by the distance
-        return torch.cat([dataclasses.replace(self, object_distances=z)._of_one_distance(at)[:, 0] for z, at in pairs])
+        return torch.cat([dataclasses.replace(self, object_distances=z)._of_one_distance(p)[:, 0] for z, p in pairs])
 
     @property
     def _has_radii(self) -> bool:
@@ -159,7 +173,7 @@ class FieldKernels:
         return self.model == "gaussian" and how == ("chief", "window", False) and is_round_about_axis(self.lens)
 
     @property
-    def _model(self) -> object:
+    def _model(self) -> Model:
         parameters = model_of(self.model) if self.parameters is None else self.parameters
         return parameters if has_points(parameters) else dataclasses.replace(parameters, order=self.order)
 
@@ -212,13 +226,15 @@ class FieldKernels:
         """Light (D, F, W, h, w), columns towards +x; 1 = all through the entrance pupil."""
         numbers = pytree.tree_leaves((self.lens, self.object_distances))
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
-            about = {"fields": fields, "object_distances": self.object_distances, "per_wavelength": True}
-            about |= {"center": "axis" if self.center == "chief" else "centroid"}
-            about |= {"execution": Execution(memo=self.memo)}
-            kernels = []
-            for wavelengths, window in self._windows(origin):
-                kernels.append(psf(self.lens, self._model, **about, grid=window, wavelengths=wavelengths).kernel)
-            return torch.cat(kernels, 2)
+            light = [
+                psf(
+                    self.lens, self._model, fields=fields, wavelengths=wavelengths, per_wavelength=True, grid=window,
+                    object_distances=self.object_distances, center="axis" if self.center == "chief" else "centroid",
+                    execution=Execution(memo=self.memo),
+                ).kernel
+                for wavelengths, window in self._windows(origin)
+            ]  # fmt: skip
+            return torch.cat(light, 2)
 
     def light(self, fields: Tensor, origin: Tensor) -> Tensor:
         """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
@@ -291,11 +307,16 @@ class FieldKernels:
         points = torch.stack([torch.zeros_like(radii), radii])
         fields = self.sensor.fields(self.lens, points)
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        about = {"fields": fields, "object_distances": self.object_distances, "per_wavelength": True}
-        spots = psf(self.lens, self._model, **about, grid=make_grid(radii.new_tensor(1.0), 1))
-        moments = spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2]
+        spots = psf(
+            self.lens, self._model, fields=fields, object_distances=self.object_distances, per_wavelength=True,
+            grid=make_grid(radii.new_tensor(1.0), 1),
+        )  # fmt: skip
         known = arrives[:, None] & ~spots.centroid[1].isnan()
-        return *(torch.where(known, moment, 0.0) for moment in moments), known.to(radii)
+        shift, sagittal, tangential = (
+            torch.where(known, moment, 0.0)
+            for moment in (spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2])
+        )
+        return shift, sagittal, tangential, known.to(radii)
 
     def origin(self, fields: Tensor) -> Tensor:
         """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1 or W), see `origin`."""
@@ -374,8 +395,10 @@ def channel_moments(
     """
     fields = sensor.fields(lens, points)
     fields = fields[:, ~fields.isnan().any(0)]
-    about = {"fields": fields, "object_distances": object_distances, "per_wavelength": True}
-    spots = psf(lens, model_of("gaussian", order=4), **about, grid=make_grid(points.new_tensor(1.0), 1))
+    spots = psf(
+        lens, model_of("gaussian", order=4), fields=fields, object_distances=object_distances, per_wavelength=True,
+        grid=make_grid(points.new_tensor(1.0), 1),
+    )  # fmt: skip
     place = spots.centroid - origin(lens, sensor, fields, object_distances, lateral_colour=lateral_colour)
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(place)
     mean = (place.nan_to_num(0.0)) @ weights.T
@@ -393,7 +416,7 @@ def field_kernels(
     weights: Tensor,
     lateral_colour: bool = True,
     elements: Sequence[Element] = (),
-    **more,
+    **more: Any,
 ) -> FieldKernels | ElementKernels:
     """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone.
 
@@ -403,16 +426,17 @@ def field_kernels(
     if elements and is_stop_alone(lens):
         check_model(model, elements)
         return ElementKernels(lens, elements, sensor, size, object_distances, weights)
-    how = {"lateral_colour": lateral_colour, "elements": elements, **more}
-    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, **how)
+    return FieldKernels(
+        lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements, **more
+    )
 
 
-def has_points(parameters: object) -> bool:
+def has_points(parameters: Model | None) -> bool:
     """Whether the parameters of a PSF model are pupil points of their own rays."""
     return isinstance(getattr(parameters, "rays", None), Tensor)
 
 
-def check_model(model: str, elements: Sequence[Element]) -> None:
+def check_model(model: str | None, elements: Sequence[Element]) -> None:
     """Raise ValueError for elements and a model of rays."""
     if elements and model != "wave":
         raise ValueError(
@@ -577,7 +601,7 @@ def order_of(
     *,
     elements: Sequence[Element] = (),
     center: Literal["chief", "centroid"] = "chief",
-    parameters: object = None,
+    parameters: Model | None = None,
 ) -> int:
     """The order of the model that meets the tolerance at field points (2, F); those that are nan do not count.
 
@@ -594,10 +618,15 @@ def order_of(
             return _order_of_elements(lens, sensor, model, fields, object_distances, size, tol, elements)
         # Width and light in the window determine the error of a Gaussian: a single pixel is enough.
         pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
-        about = {"center": center, "grid": make_grid(fields.new_tensor(pitch), size), "tol": tol}
-        about |= {"object_distances": object_distances}
+        grid = make_grid(fields.new_tensor(pitch), size)
         # Each field alone: a clipped beam has more rays of an order than the beams of other fields.
-        return max(psf(lens, parameters or model, fields=field, **about).order for field in fields.split(1, 1))
+        return max(
+            psf(
+                lens, parameters or model, fields=field, object_distances=object_distances, grid=grid, center=center,
+                tol=tol,
+            ).order or 0
+            for field in fields.split(1, 1)
+        )  # fmt: skip
 
 
 def _order_of_elements(
@@ -612,7 +641,7 @@ def _order_of_elements(
 ) -> int:
     weights, before = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(fields), None
     for order in MODELS[model].orders:
-        kernels = field_kernels(lens, sensor, model, order, size, distances, weights, elements=elements)
+        kernels = FieldKernels(lens, sensor, model, order, size, distances, weights, elements=tuple(elements))
         try:
             parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
             light = torch.cat([part.of_fields(fields) for part in parts], 1)

@@ -8,7 +8,7 @@ shift, and so does origin="grid".
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -106,18 +106,18 @@ def blur_adjoint(image: Tensor, kernel: Tensor, *, boundary: str = "valid", orig
     more = [n - 1 if boundary == "valid" else 0 for n in kernel.shape[-2:]]
     batch = broadcast_shape(image.shape[:-2], kernel.shape[:-2])
     picture = image.new_zeros(*batch, *(n + m for n, m in zip(image.shape[-2:], more, strict=True)))
-    _, transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)
+    transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)[1]
     return transpose(image.expand(*batch, *image.shape[-2:]))[0]
 
 
-def visible(picture: Tensor, spot: tuple[int, int]) -> Tensor:
+def visible(picture: Tensor, spot: Sequence[int]) -> Tensor:
     """The region (..., H - h + 1, W - w + 1) of images that a "valid" blur returns; spot: (h, w) of the kernels."""
     (rows, columns), (h, w) = picture.shape[-2:], spot
     top, left = h - 1 - h // 2, w - 1 - w // 2
     return picture[..., top : rows - h // 2, left : columns - w // 2]
 
 
-def transfer_functions(kernels: Tensor, size: int | tuple[int, int], *, origin: str = "pixel") -> Tensor:
+def transfer_functions(kernels: Tensor, size: int | Sequence[int], *, origin: str = "pixel") -> Tensor:
     """H (..., rows, columns), Fourier transforms of kernels (..., h, w) on images of that size, ordered as by `fft2`.
 
     origin: as for `blur`, which multiplies by them for boundary "circular". At origin "grid" an even kernel is 0 at the
@@ -133,7 +133,7 @@ def transfer_functions(kernels: Tensor, size: int | tuple[int, int], *, origin: 
     return transfer if origin == "pixel" else transfer * _half_pixels(kernels, shape)
 
 
-def extend(picture: Tensor, shape: tuple[int, int], *, boundary: str) -> Tensor:
+def extend(picture: Tensor, shape: Sequence[int], *, boundary: str) -> Tensor:
     """Images (..., H, W) extended to `shape`, one period of the continuation.
 
     The first half of the added rows and columns continues the last one, the second half precedes the first one.
@@ -162,8 +162,8 @@ def depth_masks(depth: Tensor, planes: Tensor, *, softness: float = 0.0, feather
         )
     beyond = depth[..., None, :, :] - (0.5 * (planes[1:] + planes[:-1]))[:, None, None]
     above = torch.sigmoid(beyond / softness) if softness > 0 else (beyond > 0).to(beyond.dtype)
-    one = torch.ones_like(depth)[..., None, :, :]
-    masks = torch.cat([one, above], -3) - torch.cat([above, torch.zeros_like(one)], -3)
+    whole = torch.ones_like(depth)[..., None, :, :]
+    masks = torch.cat([whole, above], -3) - torch.cat([above, torch.zeros_like(whole)], -3)
     if not feather > 0:
         return masks
     reach = math.ceil(4 * feather)
@@ -214,19 +214,19 @@ def blur_layers(
     # Coverage by normalised kernels: a kernel of energy below 1 darkens its layer without making it transparent.
     unit = safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
     each = enumerate(extended_layers(layers * scene, masks, background))
-    of = [(d if kernels.shape[-4] > 1 else 0, *layer) for d, layer in each]
+    covered = [(d if kernels.shape[-4] > 1 else 0, *layer) for d, layer in each]
     return occlusion(
         (
             blur(light, kernels[..., d, :, :, :], boundary=boundary),
             blur(cover, unit[..., d, :, :, :], boundary=boundary),
         )
-        for d, light, cover in of
+        for d, light, cover in covered
     )
 
 
 def occlusion(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     """The image (..., C, H, W) of layers from far to near, each its light and its coverage; the first one is opaque."""
-    total = 0.0
+    total = torch.zeros(())
     for light, cover in layers:
         total = (1 - cover) * total + light
     return total
@@ -270,8 +270,9 @@ def _filled(values: Tensor, known: Tensor) -> Tensor:
     )
     pooled = pooled.reshape(*batch.shape[:-2], *pooled.shape[-2:])
     coarse = _filled(pooled[..., :-1, :, :], pooled[..., -1:, :, :])
-    how = {"size": (rows, columns), "mode": "bilinear", "align_corners": False}
-    around = torch.nn.functional.interpolate(coarse.reshape(-1, *coarse.shape[-3:]), **how).reshape(values.shape)
+    around = torch.nn.functional.interpolate(
+        coarse.reshape(-1, *coarse.shape[-3:]), size=(rows, columns), mode="bilinear", align_corners=False
+    ).reshape(values.shape)
     return around + _sure(known) * (mean - around)
 
 
@@ -299,7 +300,7 @@ def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tens
     return torch.cat([picture, last + fade * (first - last)], axis)
 
 
-def _half_pixels(kernel: Tensor, shape: tuple[int, int]) -> Tensor:
+def _half_pixels(kernel: Tensor, shape: Sequence[int]) -> Tensor:
     """Phases exp(-iπf) (rows, columns) that shift kernels by half a pixel along every axis of even size."""
     phases = []
     for count, size in zip(shape, kernel.shape[-2:], strict=True):
@@ -332,7 +333,7 @@ def _check_choice(choice: str, known: tuple[str, ...], what: str) -> None:
         raise ValueError(f"{what} {choice!r}: expected {', '.join(known)}")
 
 
-def check_fit(small, large, what: str = "a kernel", where: str = "a picture") -> None:
+def check_fit(small: Sequence[int], large: Sequence[int], what: str = "a kernel", where: str = "a picture") -> None:
     """Raise ValueError unless `small` (rows, columns) fit into `large`."""
     (h, w), (rows, columns) = small, large
     if h > rows or w > columns:

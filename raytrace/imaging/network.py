@@ -5,12 +5,16 @@ starts from zero, and an untrained network returns its input.
 """
 
 import dataclasses
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad
 
 from raytrace.imaging.image import as_picture
+
+Convolution: TypeAlias = nn.Conv2d | nn.ConvTranspose2d
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +33,9 @@ class UNetShape:
     width: int = 16
 
 
+_CPU = RedNetShape(10, 32)
 #: By name: RED-Net of the published comparison, one that two CPU cores train in minutes, and a U-Net of similar cost.
-PRESETS = {"paper": RedNetShape(30, 64), "cpu": RedNetShape(10, 32), "unet": UNetShape()}
+PRESETS: dict[str, RedNetShape | UNetShape] = {"paper": RedNetShape(30, 64), "cpu": _CPU, "unet": UNetShape()}
 
 
 def network(preset: str | RedNetShape | UNetShape, *, channels: int = 1, seed: int = 0) -> nn.Module:
@@ -54,17 +59,17 @@ class RedNet(nn.Module):
     (arXiv:1603.09056).
     """
 
-    def __init__(self, shape: RedNetShape = PRESETS["cpu"], *, channels: int = 1, seed: int = 0):
+    def __init__(self, shape: RedNetShape = _CPU, *, channels: int = 1, seed: int = 0):
         super().__init__()
         if shape.depth < 2 or shape.depth % 2 or shape.width < 1:
             raise ValueError(f"RED-Net of depth {shape.depth} and width {shape.width}: expected an even depth ≥ 2")
         self.channels = _checked_channels("RED-Net", channels)
         half, width = shape.depth // 2, shape.width
-        self.encoder = nn.ModuleList(nn.Conv2d(width if i else channels, width, 3, padding=1) for i in range(half))
-        self.decoder = nn.ModuleList(
-            nn.ConvTranspose2d(width, width if i < half - 1 else channels, 3, padding=1) for i in range(half)
-        )
-        _start([*self.encoder, *self.decoder], seed)
+        encoder = [nn.Conv2d(width if i else channels, width, 3, padding=1) for i in range(half)]
+        ends = [*[width] * (half - 1), channels]
+        decoder = [nn.ConvTranspose2d(width, maps, 3, padding=1) for maps in ends]
+        self.encoder, self.decoder = nn.ModuleList(encoder), nn.ModuleList(decoder)
+        _start([*encoder, *decoder], seed)
 
     def forward(self, picture: Tensor) -> Tensor:
         """picture: (B, C, H, W) of the network's channels; returns the restored images of the same shape.
@@ -78,7 +83,8 @@ class RedNet(nn.Module):
             features.append(x)
         last = len(self.decoder)
         for i, layer in enumerate(self.decoder, 1):
-            x = conv2d(x, layer.weight.flip(-2, -1).transpose(0, 1), layer.bias, padding=1)
+            weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
+            x = conv2d(x, weight.flip(-2, -1).transpose(0, 1), bias, padding=1)
             if i < last:
                 x = (x.add_(features[last - i - 1]) if i % 2 else x).relu_()
         return picture + x
@@ -108,7 +114,7 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(_pair(2 * m, m) for m in maps[:-1])
         self.last = nn.Conv2d(width, channels, 1)
         _start([layer for layer in self.modules() if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)], seed)
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's overloads
 
     def forward(self, picture: Tensor) -> Tensor:
         """picture: (B, C, H, W) of the network's channels; returns the restored images of the same shape.
@@ -136,7 +142,7 @@ def _pair(before: int, after: int) -> nn.Sequential:
 
 
 @torch.no_grad()
-def _start(layers: list[nn.Module], seed: int) -> None:
+def _start(layers: Sequence[Convolution], seed: int) -> None:
     """Random weights of layers in this order, and of the last one zero."""
     generator = torch.Generator().manual_seed(seed)
     for layer in layers:
@@ -144,7 +150,8 @@ def _start(layers: list[nn.Module], seed: int) -> None:
         count = layer.kernel_size[0] * layer.kernel_size[1] // (layer.stride[0] * layer.stride[1])
         scale = (2 / (count * layer.in_channels)) ** 0.5
         layer.weight.copy_(scale * torch.randn(layer.weight.shape, generator=generator))
-        layer.bias.zero_()
+        if layer.bias is not None:
+            layer.bias.zero_()
     layers[-1].weight.zero_()
 
 

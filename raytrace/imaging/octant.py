@@ -81,7 +81,8 @@ def _to_octant(rows: int, pitch: float, cutoff: float, order: int, size: int) ->
 
 def _octant(size: int) -> tuple[Tensor, Tensor]:
     """Rows and columns (F,) of the frequencies 0 <= a <= b <= size/2, that of the mean first."""
-    return torch.triu_indices(size // 2 + 1, size // 2 + 1).unbind()
+    rows, columns = torch.triu_indices(size // 2 + 1, size // 2 + 1)
+    return rows, columns
 
 
 def fits(scene: WaveScene, plan: Plan, spectrum: Tensor) -> bool:

@@ -46,7 +46,7 @@ def digest(samples: Sequence[np.ndarray]) -> str:
     pixels = hashlib.blake2b(digest_size=8)
     for sample in samples:
         pixels.update(repr(sample.shape).encode())
-        pixels.update(np.ascontiguousarray(sample))
+        pixels.update(np.ascontiguousarray(sample).data)
     return f"{len(samples)}, blake2 {pixels.hexdigest()}"
 
 
@@ -88,10 +88,11 @@ def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pic
         raise NoPictures(f"{len(pictures)} picture cannot be split into training and test ones: give two at least")
     order = draws(seed, _SPLIT).permutation(len(pictures))
     count = min(max(1, round(share * len(order))), len(order) - 1)
-    return tuple(
+    train, test = (
         Pictures(tuple(pictures.samples[i] for i in part), tuple(pictures.names[i] for i in part))
         for part in (np.sort(order[:count]), np.sort(order[count:]))
     )
+    return train, test
 
 
 def dead_leaves(
@@ -125,23 +126,22 @@ def _colours(random: np.random.Generator, count: int, correlation: float) -> np.
     """Levels (count, 3), each uniform in 0 … 255, of Gaussian numbers through their distribution function."""
     # Ranks of two Gaussian numbers of correlation r are correlated by (6/π) asin(r/2) (Pearson, 1907).
     of_gaussians = 2 * np.sin(np.pi * correlation / 6)
-    common, own = random.standard_normal((count, 1)), random.standard_normal((count, 3))
-    share = ndtr(np.sqrt(of_gaussians) * common + np.sqrt(1 - of_gaussians) * own)
+    common, single = random.standard_normal((count, 1)), random.standard_normal((count, 3))
+    share = ndtr(np.sqrt(of_gaussians) * common + np.sqrt(1 - of_gaussians) * single)
     return np.minimum(255, (256 * share).astype(int))
 
 
 def _leaves(size: int, random: np.random.Generator, smallest: float, correlation: float | None) -> np.ndarray:
     """Grey for a correlation of None."""
-    grey = correlation is None
-    picture = np.zeros((size, size) if grey else (size, size, 3), np.uint8)
+    picture = np.zeros((size, size) if correlation is None else (size, size, 3), np.uint8)
     bare, largest = np.ones((size, size), bool), size / 2
     while bare.any():
         # The next discs, the topmost first; of density ∝ r⁻³, so that 1/r² is uniform.
         radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, 4096))
         x, y = random.uniform(-1, 1, (2, 4096)) * (size / 2 + radius) + size / 2
-        discs = radius, x, y, random.integers(0, 256, 4096) if grey else _colours(random, 4096, correlation)
+        levels = random.integers(0, 256, 4096) if correlation is None else _colours(random, 4096, correlation)
         cover = _cover_by_disc if bare.sum() > _FEW_BARE else _cover_by_pixel
-        cover(picture, bare, *discs)
+        cover(picture, bare, radius, x, y, levels)
     return picture
 
 
@@ -149,8 +149,8 @@ def _cover_by_disc(picture: np.ndarray, bare: np.ndarray, *discs: np.ndarray) ->
     """Every disc, the topmost first, covers the bare pixels inside it; the pixels of 128 discs are computed at once."""
     size, picture, bare = len(picture), picture.reshape(-1, *picture.shape[2:]), bare.reshape(-1)
     for radius, x, y, shade in zip(*(np.split(values, 32) for values in discs), strict=True):
-        left, top = (np.maximum(0, (at - radius).astype(int)) for at in (x, y))
-        right, bottom = (np.minimum(size, (at + radius).astype(int) + 2) for at in (x, y))
+        left, top = (np.maximum(0, (centre - radius).astype(int)) for centre in (x, y))
+        right, bottom = (np.minimum(size, (centre + radius).astype(int) + 2) for centre in (x, y))
         width = right - left
         count = width * (bottom - top)
         disc = np.repeat(np.arange(len(radius)), count)

@@ -15,12 +15,12 @@ p(r′): the paraxial image of the object whose chief ray meets the sensor at r�
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Self
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
 from raytrace.maths.numerics import placed, varies
 from raytrace.maths.result import Result, plain
-from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled
+from raytrace.plotting.style import FIELD_COLOURS, Figure, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.system.lens import Lens, check_media, field_points, is_round_about_axis, with_wavelengths
@@ -64,6 +64,9 @@ from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
 from raytrace.words import RaytraceWarning, calling_level
+
+#: A PSF model, its order and the pixels across its window.
+Rung: TypeAlias = tuple[str, int, int]
 
 _MOST_NODES = 65  # along the longer side
 _DEGREE = 13  # of the polynomials of the distortion of other lenses
@@ -154,15 +157,16 @@ class ImageFormation:
 
         blurs = 1 if depth is None else 2 * len(self.planes)
         each = None if progress is None else _of_several(progress, blurs)
-        how = {"boundary": boundary, "tol": _LOW_RANK * self.tol, "progress": each}
+        blurred = partial(varying_blur, boundary=boundary, tol=_LOW_RANK * self.tol, progress=each)
         flux = [enlarged(part, picture) for part in self.flux]
         flux = flux if self.lit is None else [part * self.lit for part in flux]
-        window, haze = [1.0] * len(self.planes), 0.0
+        window: Sequence[Tensor | float] = [1.0] * len(self.planes)
+        haze: Tensor | float = 0.0
         if self.haze is not None:
             share = self.haze.to(picture)[..., None, None]
             window, haze = (1 - share).unbind(), share.mean(0) * (flux[0] * picture).mean((-2, -1), keepdim=True)
         if depth is None:
-            image = window[0] * varying_blur(flux[0] * warped(picture), self.kernels[:, :, 0], **how) + haze
+            image = window[0] * blurred(flux[0] * warped(picture), self.kernels[:, :, 0]) + haze
             return binned(image, self.sampling)
         shade = 1.0 if self.illumination is None else self.illumination.to(picture)
         shade = shade if self.lit is None else torch.where(self.lit, shade, 1.0)
@@ -173,12 +177,10 @@ class ImageFormation:
         parts = warped(torch.cat([masks[..., None, :, :] * picture[..., None, :, :, :], masks[..., None, :, :]], -3))
         behind = None if background is None else warped(background)
 
-        def layers():
+        def layers() -> Iterator[tuple[Tensor, Tensor]]:
             each = extended_layers(parts[..., :-1, :, :], parts[..., -1, :, :], behind)
             for d, (light, cover) in enumerate(each):
-                light, coverage = (
-                    varying_blur(flux[d] * part, self.kernels[:, :, d], **how) for part in (light, cover / shade)
-                )
+                light, coverage = (blurred(flux[d] * part, self.kernels[:, :, d]) for part in (light, cover / shade))
                 yield window[d] * light, coverage
 
         return binned(occlusion(layers()) + haze, self.sampling)
@@ -281,7 +283,8 @@ def optics(
     """
     elements, whole = in_contact(elements), sensor
     if sampling > 1:
-        sensor = dataclasses.replace(sensor, pixels=tuple(sampling * count for count in sensor.pixels), mosaic="none")
+        columns, rows = sensor.pixels
+        sensor = dataclasses.replace(sensor, pixels=(sampling * columns, sampling * rows), mosaic="none")
     if model not in (None, *MODELS):
         raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
     if order is not None and model is None and not elements:
@@ -294,34 +297,36 @@ def optics(
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
-    named = lens
-    how = {"lateral_colour": lateral_colour, "elements": elements}
+    of_fields = lens
     if wavelengths is not None:
         lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
     sampled = lens
-    over_response = wavelengths is None and sensor.response is not None and len(lens.wavelengths) > 1
+    response = sensor.response if wavelengths is None and len(lens.wavelengths) > 1 else None
     if not is_stop_alone(lens):
-        few = _at_wavelengths(lens, *band(sensor.response), _WAVELENGTHS[0]) if over_response else lens
-        about = partial(_image_circle, named, sensor, like)
+        few = lens if response is None else _at_wavelengths(lens, *band(response), _WAVELENGTHS[0])
+        about = partial(_image_circle, of_fields, sensor, like)
         _check_reach(few, sensor, about, model, size, nodes, distances, lateral_colour, tol)
-    circle = None if is_stop_alone(lens) else _image_circle(named, sensor, like)
+    circle = None if is_stop_alone(lens) else _image_circle(of_fields, sensor, like)
     corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
-    if over_response and not is_stop_alone(lens):
-        sampled = _over_response(lens, sensor, diagonal, distances, lateral_colour, _SPECTRUM * tol)
+    if response is not None and not is_stop_alone(lens):
+        sampled = _over_response(lens, sensor, band(response), diagonal, distances, lateral_colour, _SPECTRUM * tol)
     weights = sensor.weights(sampled.wavelengths, sampled.wavelength_weights).to(like)
-    chosen, reason = _model_of(sampled, sensor, model, order, size, corners, diagonal, distances, weights, tol, how)
+    chosen, reason = _model_of(
+        sampled, sensor, model, order, size, corners, diagonal, distances, weights, tol, lateral_colour, elements
+    )
     model, order, size = chosen
     _afford_kernels((3, 3) if nodes is None else nodes, len(distances), weights, size, sensor)
-    kernels, haze = field_kernels(sampled, sensor, model, order, size, distances, weights, **how), None
+    kernels = field_kernels(sampled, sensor, model, order, size, distances, weights, lateral_colour, elements)
+    haze = None
     if isinstance(kernels, FieldKernels):
         grid, error = _grid(kernels, circle, nodes, _BETWEEN * tol, like)
     else:
         light = kernels.light()
         grid, haze, error = kernels.of_light(light)[None, None], 1 - kernels.share(light), 0.0
     along_radii = is_round_about_axis(lens) and (illumination or distortion)
-    pixels = _every_pixel(sensor, like) if along_radii or circle is not None else None
-    lit = None if circle is None else _is_lit(circle, pixels)
-    pixels = _within(circle, pixels) if along_radii else None
+    places = _every_pixel(sensor, like) if along_radii or circle is not None else None
+    lit = None if circle is None or places is None else _is_lit(circle, places)
+    pixels = _within(circle, places) if along_radii and places is not None else None
     shade = _illumination(lens, sensor, circle, pixels, like) if illumination else None
     ideal = _ideal(lens, sensor, circle, pixels, like) if distortion and not is_stop_alone(lens) else None
     flux = _flux(grid, shade, sensor)
@@ -355,7 +360,8 @@ def _check_reach(
     weights, circle = sensor.weights(lens.wavelengths, lens.wavelength_weights), image_circle(_ABOUT * corner)
 
     def check(share: float) -> None:
-        part = dataclasses.replace(sensor, size=tuple(share * side for side in sensor.size))
+        width, height = sensor.size
+        part = dataclasses.replace(sensor, size=(share * width, share * height))
         corners = _within(circle, part.corners.to(lens.surfaces[-2].thickness))
         about = lens, part, model or "gaussian", corners, distances
         window = size or window_size(*about, lateral_colour=lateral_colour, tol=tol)
@@ -407,23 +413,29 @@ def _diagonal(lens: Lens, sensor: Sensor) -> Tensor:
 
 @torch.no_grad()
 def _over_response(
-    lens: Lens, sensor: Sensor, places: Tensor, distances: Tensor, lateral_colour: bool, tol: float
+    lens: Lens,
+    sensor: Sensor,
+    ends: tuple[float, float],
+    places: Tensor,
+    distances: Tensor,
+    lateral_colour: bool,
+    tol: float,
 ) -> Lens:
     """The lens at as many equidistant wavelengths over the response as the kernels of the channels need.
 
     The error of a number is the change of the channels' Gaussian kernels to about 1.5 times as many: of a shift d and a
-    difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². Warns NotConverged.
+    difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². ends: of the response, µm. Warns NotConverged.
     """
     sensor.weights(lens.wavelengths)  # a lens of another band is an error
     before = None
     for count in _WAVELENGTHS:
-        sampled = _at_wavelengths(lens, *band(sensor.response), count)
+        sampled = _at_wavelengths(lens, *ends, count)
         mean, variance = channel_moments(sampled, sensor, places, distances, lateral_colour=lateral_colour)
         if before is not None:
             square = variance + sensor.pitch**2 / 12
             shift, wider = mean - before[1], variance - before[2]
-            change = math.sqrt(2 / math.pi) * shift.abs() / square.sqrt()
-            change = float((change + math.sqrt(2 / (math.pi * math.e)) * wider.abs() / square).max())
+            moved = math.sqrt(2 / math.pi) * shift.abs() / square.sqrt()
+            change = float((moved + math.sqrt(2 / (math.pi * math.e)) * wider.abs() / square).max())
             if change <= tol:
                 return before[0]
         before = sampled, mean, variance
@@ -470,25 +482,30 @@ def _model_of(
     distances: Tensor,
     weights: Tensor,
     tol: float,
-    how: dict,
-) -> tuple[tuple[str, int, int], str]:
+    lateral_colour: bool,
+    elements: tuple[Element, ...],
+) -> tuple[Rung, str]:
     """Model, order and window of the kernels, and the reason for the model.
 
     Without a model: the first one of the ladder of `psf_models` that traces rays whose kernels on the diagonal differ
     from the next model's by less than the tolerance. Warns NotConverged where waves need too many rays.
     """
 
-    def fitted(name: str) -> tuple[str, int, int]:
-        window = size or window_size(lens, sensor, name, corners, distances, **how, tol=tol)
+    def fitted(name: str) -> Rung:
+        window = size or window_size(
+            lens, sensor, name, corners, distances, lateral_colour=lateral_colour, elements=elements, tol=tol
+        )
         if order is not None:
             return name, order, window
         about = lens, sensor, name, sensor.fields(lens, diagonal), distances, window, _MODEL * tol
-        return name, order_of(*about, elements=how["elements"]), window
+        return name, order_of(*about, elements=elements), window
 
     if model is not None:
         return fitted(model), ""
     ring = 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))  # λN
-    airy, chosen, before = 1.22 * ring, None, None
+    airy, reason = 1.22 * ring, ""
+    chosen: Rung | None = None
+    before: Tensor | None = None
     with torch.no_grad():
         for row in (row for row in MODELS.values() if row.is_rung and row.traces):
             try:
@@ -497,12 +514,14 @@ def _model_of(
                         f"the rays reach {reach:.0f} λN from their middle, waves are tried up to {_WIDE:g}"
                     )
                 rung = fitted(row.name)
-                kernels = field_kernels(lens, sensor, *rung, distances, weights, how["lateral_colour"]).at(diagonal)
+                kernels = field_kernels(lens, sensor, *rung, distances, weights, lateral_colour).at(diagonal)
             except WindowTooLarge:  # the tails of a Gaussian, which rays and waves do not have
                 if row.name != "gaussian":
                     raise
                 continue
             except (TooManyPoints, OverBudget) as error:
+                if chosen is None:
+                    raise
                 # Of a point in the middle of a pixel: a circular pupil has 2/(π² R) of its light beyond R λN.
                 share = _BEYOND * ring / sensor.pitch
                 reason = f"{100 * share:.2g} % of the light of a point, or less"
@@ -510,12 +529,13 @@ def _model_of(
                     message = f"{chosen[0]}: diffraction is left out, {reason}; {error}"
                     warnings.warn(message, NotConverged, stacklevel=calling_level())
                 return chosen, reason
-            if chosen is not None:
+            if chosen is not None and before is not None:
                 gap = _apart(kernels, before)
                 if gap <= tol and (row.waves or sensor.pitch > 4 * airy):
                     return chosen, f"{row.name} differs by {gap:.1e} of the light"
                 reason = f"{chosen[0]} differs by {gap:.1e} of the light"
             chosen, before = rung, kernels
+    assert chosen is not None  # of DRT, or it raised
     return chosen, reason
 
 
@@ -603,7 +623,8 @@ def _places(sensor: Sensor, m: int, n: int, like: Tensor, shift: float = 0.0) ->
 def _nodes(sensor: Sensor, count: int) -> tuple[int, int]:
     """Numbers of rows and columns of a grid of nodes, `count` of them along the longer side."""
     columns, rows = sensor.pixels
-    return tuple(max(2, round((count - 1) * side / max(columns, rows)) + 1) for side in (rows, columns))
+    m, n = (max(2, round((count - 1) * side / max(columns, rows)) + 1) for side in (rows, columns))
+    return m, n
 
 
 def _grid(
@@ -688,8 +709,8 @@ def enlarged(light: Tensor, picture: Tensor) -> Tensor:
     """Numbers (C, H′, W′) on larger pixels, at the pixels of pictures (..., C, H, W), bilinear."""
     if light.shape[-2:] == picture.shape[-2:]:
         return light.to(picture)
-    how = {"size": picture.shape[-2:], "mode": "bilinear", "align_corners": False}
-    return torch.nn.functional.interpolate(light.to(picture)[None], **how)[0]
+    light, size = light.to(picture)[None], picture.shape[-2:]
+    return torch.nn.functional.interpolate(light, size=size, mode="bilinear", align_corners=False)[0]
 
 
 def _illumination(
@@ -735,10 +756,10 @@ def _ideal(
     points = _within(circle, _places(sensor, _FIT, _FIT, like))
     shift = sensor.pixel_of(_paraxial_image(lens, sensor, points)) - sensor.pixel_of(points)
     columns, rows = sensor.pixels
-    row, column = (_chebyshev(count, _FIT, like) for count in (rows, columns))
+    down, across = (_chebyshev(count, _FIT, like) for count in (rows, columns))
     # Least squares by the pseudoinverse along either axis.
-    fitted = [torch.linalg.pinv(row[0]) @ part.reshape(_FIT, _FIT) @ torch.linalg.pinv(column[0]).T for part in shift]
-    shift = torch.stack([row[1] @ part @ column[1].T for part in fitted])
+    fitted = [torch.linalg.pinv(down[0]) @ part.reshape(_FIT, _FIT) @ torch.linalg.pinv(across[0]).T for part in shift]
+    shift = torch.stack([down[1] @ part @ across[1].T for part in fitted])
     lines = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, columns))
     row, column = torch.meshgrid(*lines, indexing="ij")
     return torch.stack([column, row]) + shift
@@ -758,7 +779,8 @@ def _chebyshev(count: int, places: int, like: Tensor) -> tuple[Tensor, Tensor]:
     fitted = torch.linspace(-1, 1, places, dtype=like.dtype, device=like.device)
     pixels = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (2 / count) - 1
     orders = torch.arange(_DEGREE + 1, dtype=like.dtype, device=like.device)
-    return tuple(torch.cos(torch.acos(x.clamp(-1, 1))[:, None] * orders) for x in (fitted, pixels))
+    at_places, at_pixels = (torch.cos(torch.acos(x.clamp(-1, 1))[:, None] * orders) for x in (fitted, pixels))
+    return at_places, at_pixels
 
 
 def _every_pixel(sensor: Sensor, like: Tensor) -> Tensor:
@@ -820,8 +842,8 @@ def render(
     if not isinstance(lens, Lens):
         if elements:
             raise ValueError("elements without a lens are the first argument of render: leave out elements=…")
-        lens, elements = element_in_stop(lens, sensor, sensor_distance, wavelengths), lens
-        wavelengths = None
+        elements, wavelengths_of_stop, wavelengths = lens, wavelengths, None
+        lens = element_in_stop(elements, sensor, sensor_distance, wavelengths_of_stop)
     elif sensor_distance is not None:
         raise ValueError("a lens has a sensor distance: give lens.at(sensor_distance=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
@@ -837,8 +859,8 @@ def render(
         lens, sensor, elements=elements, model=model, wavelengths=wavelengths, object_distances=distances, tol=tol,
         distortion=distortion, lateral_colour=lateral_colour, illumination=illumination, size=size, sampling=sampling,
     )  # fmt: skip
-    how = {"background": background, "softness": softness, "boundary": boundary, "progress": progress}
-    return Rendering(ready(light, depth, **how), binned(light, sampling), lens, ready)
+    image = ready(light, depth, background=background, softness=softness, boundary=boundary, progress=progress)
+    return Rendering(image, binned(light, sampling), lens, ready)
 
 
 def element_in_stop(
@@ -920,8 +942,8 @@ def patch_kernels(
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
     elements = in_contact(elements)
     model = model or ("wave" if elements else "gaussian")
-    kernels = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
-    kernels = kernels.paired(points)
+    of_places = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
+    kernels = of_places.paired(points)
     warn_of_dark_places(kernels, points)
     return illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
 
@@ -953,7 +975,7 @@ def default_sensor(
     *,
     size: tuple[float, float] | None = None,
     offset: tuple[float, float] = (0, 0),
-    **others,
+    **others: Any,
 ) -> Sensor:
     """A sensor for pictures (..., C, H, W), by default so large that the largest field of the lens lies in its corners.
 
@@ -987,7 +1009,7 @@ class Rendering(Result):
         self,
         picture: Tensor,
         depth: Tensor | None = None,
-        **options,
+        **options: Any,
     ) -> Self:
         """The rendering of another picture of the same size by the same optics.
 
@@ -1016,7 +1038,8 @@ class Rendering(Result):
         .png: sRGB levels of 8 or 16 bits; .tif: light, 32-bit floating-point numbers; .npy: light (C, H, W), an array;
         .json as other results.
         """
-        suffix = Path(path).suffix.lower()
+        path = Path(path)
+        suffix = path.suffix.lower()
         if suffix not in (".png", ".tif", ".npy"):
             return super().save(path)
         image = self.image.detach()
@@ -1055,7 +1078,7 @@ class Rendering(Result):
         if (darkest := self._darkest()) is not None:
             lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of the axis")
         if ready.ideal is not None and max(ready.ideal.shape[-2:]) > 1:
-            last, first = self._ends()
+            last, first = self._ends(ready.ideal)
             (column, row), ideal = last - first, ready.ideal[:, last[1], last[0]] - ready.ideal[:, first[1], first[0]]
             longer = math.hypot(column, row) / math.hypot(*ideal.tolist()) - 1
             lines.append(f"distortion of the diagonal{self._inside()} {100 * longer:+.2f} %")
@@ -1071,9 +1094,9 @@ class Rendering(Result):
             return None
         return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).min())
 
-    def _ends(self) -> np.ndarray:
+    def _ends(self, ideal: Tensor) -> np.ndarray:
         """Column and row (2, 2) of the last and the first pixel on the diagonal that light reaches."""
-        rows, columns = self.optics.ideal.shape[-2:]
+        rows, columns = ideal.shape[-2:]
         steps = np.linspace(0, 1, max(rows, columns))
         places = np.stack([(columns - 1) * steps, (rows - 1) * steps], 1).round().astype(int)
         lit = None if self.optics.lit is None else array(self.optics.lit)[places[:, 1], places[:, 0]]
@@ -1096,7 +1119,7 @@ class Rendering(Result):
         }
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """The ideal lens's picture and the image, both in detail at the centre and at the upper left corner, and the
         kernels there, of several depths the farthest; brightness is encoded as sRGB."""
         ideal, image = (_shown(picture) for picture in (self.picture, self.image))
@@ -1118,7 +1141,7 @@ class Rendering(Result):
             f"{self.lens.name}   {width:.4g} × {height:.4g} mm, {columns} × {rows} pixels of "
             f"{1e3 * ready.sensor.pitch:.4g} µm", fontsize=9,
         )  # fmt: skip
-        whole, close = figure.subfigures(2, 1, height_ratios=heights)
+        whole, close = cast(np.ndarray, figure.subfigures(2, 1, height_ratios=heights))
         pictures = {"ideal lens": ideal, "this lens": image}
         for panel, (title, picture) in zip(whole.subplots(1, 2), pictures.items(), strict=True):
             panel.imshow(picture, vmin=0, vmax=1, cmap="gray")

@@ -163,7 +163,7 @@ def joint_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Te
 
 def joint_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
     """Diagonals of E (..., C, frequencies), whose means over all frequencies are `joint_error`."""
-    return sum(_square(column) for column in _joint_steps(transfer, spectrum, sigma)[0])
+    return sum((_square(column) for column in _joint_steps(transfer, spectrum, sigma)[0]), torch.zeros(()))
 
 
 def joint_kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
@@ -366,7 +366,7 @@ def _constants(square: Tensor, like: Tensor) -> Tensor:
 
 
 def power_law(
-    size: int | tuple[int, int], *, mean: float = 0.5, deviation: float = 0.25, exponent: float = 2.0
+    size: int | Sequence[int], *, mean: float = 0.5, deviation: float = 0.25, exponent: float = 2.0
 ) -> Tensor:
     """S ∝ 1/|f|^exponent of natural images (Field, 1987), float64; mean, deviation: those of a pixel."""
     rows, columns = (size, size) if isinstance(size, int) else size

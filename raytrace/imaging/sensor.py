@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from raytrace.io import as_lens
 from raytrace.maths.numerics import differentiating, varies
 from raytrace.system.lens import Lens, aligned, wavelengths_of, with_field_kind
 from raytrace.tracing.launch import field_of_object, object_field, rays_of_field
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.trace import points_at
 from raytrace.words import named_value
 
@@ -71,7 +72,7 @@ class Sensor:
     black_level: float | None = None
     saturation: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, kind, expected in (
             ("size", float, "(width, height) mm, above 0"),
             ("pixels", int, "(columns, rows), whole numbers above 0"),
@@ -170,11 +171,11 @@ class Sensor:
         points = _components(points, "points").to(lens.surfaces[-2].thickness)
         known = torch.isfinite(points.detach()).all(0)
         lens, points = aligned(lens, points.dim() - 1, exactly=True), torch.where(known, points, 0.0)
-        paraxial = first_order(lens)
-        extent, found = object_field(with_field_kind(lens, "real_image_height"), points, paraxial)
+        paraxial = axial_beam(lens)
+        extent, arrives = object_field(with_field_kind(lens, "real_image_height"), points, paraxial)
         of_image = lens.fields.kind == "real_image_height"
         fields = points.expand_as(extent) if of_image else field_of_object(lens, extent, paraxial)
-        return torch.where(found & known, fields, torch.nan)
+        return torch.where(arrives & known, fields, torch.nan)
 
     def landing(self, lens: Lens, fields: Tensor, wavelengths: Tensor | Sequence[float] | None = None) -> Tensor:
         """Points (2, ...) mm where the chief rays of fields (2, ...) meet the sensor: the inverse of `fields`.
@@ -295,7 +296,7 @@ class Sensor:
         picture = self.sample(picture, origin)
         if self.full_well is not None or self.read_noise > 0:
             each = zip(picture.reshape(-1, *picture.shape[-3:]), index, strict=True)
-            noisy = [self._noisy(one, _generator(seed, number, picture.device)) for one, number in each]
+            noisy = [self._noisy(part, _generator(seed, number, picture.device)) for part, number in each]
             picture = torch.stack(noisy).reshape(picture.shape)
         if self.bits is None:
             return picture.clamp(max=self.saturation)
@@ -335,7 +336,7 @@ class Sensor:
         height, width = self._patch(size)
         (columns, rows), index = self.pixels, torch.as_tensor(index).reshape(-1)
         random = (draws(_whole(seed, "seed"), number, _PATCH) for number in _indices(index.shape, index))
-        origins = [[one.integers(columns - width + 1), one.integers(rows - height + 1)] for one in random]
+        origins = [[r.integers(columns - width + 1), r.integers(rows - height + 1)] for r in random]
         return torch.tensor(np.array(origins, np.int64).reshape(-1, 2))
 
     def patch_points(self, origins: Tensor, size: int | tuple[int, int]) -> Tensor:
@@ -353,17 +354,17 @@ class Sensor:
         return height, width
 
 
-def _pair(numbers: object, name: str, kind: type, expected: str) -> tuple:
+def _pair(numbers: Any, name: str, kind: type, expected: str) -> tuple:
     """Two plain numbers; those of a size and of pixels are above 0."""
     try:
-        found = tuple(kind(number) for number in numbers)
-        usable = len(found) == 2 and all(map(math.isfinite, found)) and found == tuple(map(float, numbers))
+        pair = tuple(kind(number) for number in numbers)
+        usable = len(pair) == 2 and all(map(math.isfinite, pair)) and pair == tuple(map(float, numbers))
     except (TypeError, ValueError):
         usable = False
-    if not usable or (name != "offset" and min(found) <= 0):
+    if not usable or (name != "offset" and min(pair) <= 0):
         shown = numbers if isinstance(numbers, (tuple, list)) else named_value(numbers)
         raise ValueError(f"{name} {shown}: expected {expected}")
-    return found
+    return pair
 
 
 def _numbers(numbers: object) -> Tensor:
@@ -380,7 +381,7 @@ def _components(points: object, name: str) -> Tensor:
     return points
 
 
-def _whole(number: object, name: str) -> int:
+def _whole(number: float, name: str) -> int:
     if isinstance(number, float) or int(number) < 0:
         raise ValueError(f"{name} {number!r}: expected a whole number from 0 up")
     return int(number)

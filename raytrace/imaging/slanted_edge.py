@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.imaging.image import as_picture, linearised
 from raytrace.maths.result import Column, Result, Table
-from raytrace.plotting.style import GREY, array, field_colour, new_figure, styled
+from raytrace.plotting.style import GREY, Figure, array, field_colour, new_figure, styled
 
 _OVERSAMPLING = 4  # bins a pixel
 _LEAST_SIDE, _LEAST_MARGIN = 16, 6  # pixels of a picture, and from its edge to the border
@@ -71,7 +71,7 @@ class SlantedEdgeMtf(Result):
         return [Table(self.columns(), [f"edge {self.angle:.2f}° from the {lines}, {half}"])]
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """The edge spread function over the distance from the edge, and the MTF up to one cycle a pixel."""
         figure = new_figure(8.0, 3.2)
         left, right = figure.subplots(1, 2)

@@ -34,11 +34,11 @@ class SpectralResponse:
     names: of the channels, (C,); by default r, g, b of three channels, grey of one. Raises ValueError for other tables.
     """
 
-    wavelengths: tuple[float, ...]
-    sensitivities: tuple[tuple[float, ...], ...]
-    names: tuple[str, ...] = ()
+    wavelengths: Sequence[float]
+    sensitivities: Sequence[Sequence[float]]
+    names: Sequence[str] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         wavelengths, rows = _floats(self.wavelengths), tuple(map(_floats, self.sensitivities))
         names = tuple(map(str, self.names)) or _names(len(rows))
         for name, entry in (("wavelengths", wavelengths), ("sensitivities", rows), ("names", names)):
@@ -77,7 +77,7 @@ class SpectralResponse:
     def ranges(self) -> list[tuple[float, float]]:
         """The shortest and the longest wavelength, µm, of the response of each channel."""
         responding = (
-            [at for at, entry in zip(self.wavelengths, row, strict=True) if entry >= NO_RESPONSE * max(row)]
+            [λ for λ, entry in zip(self.wavelengths, row, strict=True) if entry >= NO_RESPONSE * max(row)]
             for row in self.sensitivities
         )
         return [(wavelengths[0], wavelengths[-1]) for wavelengths in responding]
@@ -107,7 +107,7 @@ class SpectralResponse:
             except ValueError:
                 raise ValueError(f"{path}:{number}: {','.join(row)!r}; expected {len(header)} numbers") from None
         try:
-            return cls([at * _UNITS[header[0].lower()] for at in columns[0]], columns[1:], header[1:])
+            return cls([λ * _UNITS[header[0].lower()] for λ in columns[0]], columns[1:], header[1:])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
@@ -166,7 +166,7 @@ def read_response(response: object) -> SpectralResponse | str | None:
 
 def channel_names(response: SpectralResponse | str | None) -> tuple[str, ...]:
     """The names of the channels of a response: grey if there is none."""
-    return _names(1) if response is None else _of(response).names
+    return _names(1) if response is None else tuple(_of(response).names)
 
 
 def band(response: SpectralResponse | str) -> tuple[float, float]:
@@ -180,8 +180,8 @@ def channel_weights(response: SpectralResponse | str, wavelengths: Tensor) -> Te
 
     Raises ValueError for a channel that has no response (NO_RESPONSE) at any of them.
     """
-    found = _of(response).at(wavelengths)
-    largest = found.detach().amax(-1).tolist()
+    sensitivities = _of(response).at(wavelengths)
+    largest = sensitivities.detach().amax(-1).tolist()
     for name, most, (low, high) in zip(_of(response).names, largest, _of(response).ranges(), strict=True):
         if most < NO_RESPONSE:
             listed = ", ".join(f"{number:.6g}" for number in wavelengths.detach().tolist())
@@ -190,7 +190,7 @@ def channel_weights(response: SpectralResponse | str, wavelengths: Tensor) -> Te
                 f"{low:.4g} to {high:.4g} µm: add a wavelength there, as lens.at(wavelengths=…), or give a response "
                 "without this channel"
             )
-    return found / found.sum(-1, keepdim=True)
+    return sensitivities / sensitivities.sum(-1, keepdim=True)
 
 
 def _of(response: SpectralResponse | str) -> SpectralResponse | _Gaussians:

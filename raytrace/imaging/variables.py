@@ -22,7 +22,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -186,7 +186,9 @@ class Owned(nn.Module, abc.ABC):
     def set_extra_state(self, state: Tensor) -> None:
         """Does nothing: the identity of a module is constant."""
 
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, *lists) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict, prefix: str, local_metadata: dict, strict: bool, *lists: list[str]
+    ) -> None:
         stored = state_dict.get(prefix + KEY)
         if stored is None:
             if any(prefix + name in state_dict for name, _ in self.named_parameters(recurse=False)):
@@ -255,6 +257,12 @@ class Held:
     focal_length: float
     by: Variable
 
+    def number(self, lens: Lens) -> Tensor:
+        """The solved number in a lens, which models it as every variable."""
+        number = stored_number(lens, self.by.address)
+        assert number is not None
+        return number
+
 
 class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
@@ -302,7 +310,7 @@ class Variables(Owned):
         self.conditions = tuple(word for word in words if word not in efl)
         self._all = _variables(self.design, vary)
         self.held = self._held(" ".join(efl))
-        self.variables = tuple(one for one in self._all if self.held is None or one is not self.held.by)
+        self.variables = tuple(v for v in self._all if self.held is None or v is not self.held.by)
         self.names = tuple(variable.name for variable in self._all)
         lower, upper = bounds_of(lens, self.design.variables, bounds)
         ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
@@ -339,8 +347,8 @@ class Variables(Owned):
             for variable, spread in zip(self.variables, blur.tolist(), strict=True)
             if spread > _NEGLIGIBLE
         }
-        self.variables = tuple(scaled.get(one.name, one) for one in self.variables)
-        self._all = tuple(scaled.get(one.name, one) for one in self._all)
+        self.variables = tuple(scaled.get(v.name, v) for v in self.variables)
+        self._all = tuple(scaled.get(v.name, v) for v in self._all)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         # The lens first: it refuses a dtype too coarse for optics before any parameter is converted.
@@ -424,7 +432,7 @@ class Variables(Owned):
                 return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
             for further, joint in (("constraints", " "), ("solves", ", ")):
                 if before.get(further) != now.get(further):
-                    stored, current = (joint.join(one.get(further, ["none"])) for one in (before, now))
+                    stored, current = (joint.join(state.get(further, ["none"])) for state in (before, now))
                     return f"variables with the {further} {stored}, not {current}"
             for name, pair in before["variables"].items():
                 if not alike(pair, now["variables"][name]):
@@ -440,20 +448,20 @@ class Variables(Owned):
         """The number of every variable in the lens, by name."""
         numbers = dict(zip((variable.name for variable in self.variables), self._numbers().tolist(), strict=True))
         if self.held is not None:
-            numbers[self.held.by.name] = float(stored_number(self(), self.held.by.address))
+            numbers[self.held.by.name] = float(self.held.number(self()))
         return {name: numbers[name] for name in self.names}
 
     def beyond(self) -> str:
         """Why the solved number is beyond its bounds; "" where it is not."""
         if self.held is None:
             return ""
-        value, (low, high) = self.numbers()[self.held.by.name], self._range()
+        value, (low, high) = self.numbers()[self.held.by.name], self._range(self.held)
         return "" if low <= value <= high else f"{self.held.by.name} would be {value:.6g}, not from {low:g} to {high:g}"
 
-    def _range(self) -> tuple[float, float]:
+    def _range(self, held: Held) -> tuple[float, float]:
         """Bounds of the solved number; a thickness without any is at least 0."""
-        least = 0.0 if self.held.by.number.quantity == "thickness" else -math.inf
-        return self.bounds.get(self.held.by.name, (least, math.inf))
+        least = 0.0 if held.by.number.quantity == "thickness" else -math.inf
+        return self.bounds.get(held.by.name, (least, math.inf))
 
     @torch.no_grad()
     def project(self) -> None:
@@ -483,7 +491,7 @@ class Variables(Owned):
         """The numbers (n,) of the variables that are parameters."""
         return np.array(self._numbers().tolist())
 
-    def _load_from_state_dict(self, *arguments) -> None:
+    def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
         self._before = self._values()
 
@@ -509,7 +517,7 @@ class Variables(Owned):
             limits.append(self._excess)
         if "catalog" in self.conditions:
             limits.append(self._glasses)
-        lower, upper = np.array([self.bounds.get(one.name, (-math.inf, math.inf)) for one in self.variables]).T
+        lower, upper = np.array([self.bounds.get(v.name, (-math.inf, math.inf)) for v in self.variables]).T
         return Constraints(
             self._free,
             self._held_to,
@@ -523,7 +531,7 @@ class Variables(Owned):
     def _glasses(self) -> GlassLimits:
         """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
         numbers = self._free.variables
-        columns = [(one.surface, GLASS[one.quantity]) if one.quantity in GLASS else None for one in numbers]
+        columns = [(n.surface, GLASS[n.quantity]) if n.quantity in GLASS else None for n in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
             raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
@@ -549,23 +557,23 @@ class Variables(Owned):
             lens = self._free.lens_at(numbers)
             each = [*_shortfalls(lens, self.limits)] if "buildable" in self.conditions else []
             each += self._solved_beyond(lens)
-        excess = np.array([float(one.detach()) for one in each])
+        excess = np.array([float(amount.detach()) for amount in each])
         if not derivatives:
             return excess, None
-        slopes = [tangents_of(one, len(x)).detach().numpy() for one in each]
+        slopes = [tangents_of(amount, len(x)).detach().numpy() for amount in each]
         return excess, np.array(slopes).reshape(-1, len(x))
 
     def violation(self) -> Tensor:
         """`violation` of the limits of the lens, mm², and of the bounds of the solved number, in its units squared."""
         lens = self()
-        return sum((one.clamp_min(0).square() for one in self._solved_beyond(lens)), violation(lens, self.limits))
+        return sum((e.clamp_min(0).square() for e in self._solved_beyond(lens)), violation(lens, self.limits))
 
     def _solved_beyond(self, lens: Lens) -> list[Tensor]:
         """By how much the solved number of a lens is beyond each of its bounds, in its unit."""
         if self.held is None:
             return []
-        number, unit = stored_number(lens, self.held.by.address), abs(self.held.by.unit)
-        low, high = self._range()
+        number, unit = self.held.number(lens), abs(self.held.by.unit)
+        low, high = self._range(self.held)
         return [excess / unit for end, excess in ((low, low - number), (high, number - high)) if math.isfinite(end)]
 
 
@@ -577,9 +585,9 @@ def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
     lens, data = to(lens, dtype=torch.float64, device="cpu"), lens.optimization_data
     unsolved = None if data is None else dataclasses.replace(data, solves=())
     design = design_variables(dataclasses.replace(lens, optimization_data=unsolved), vary)
-    for one in design.variables:
-        if one.quantity == "glass" or (one.surface, one.quantity) == (0, "thickness"):
-            raise BadVariables(f"`vary={joined(vary)}`: {name_of(one)} is a variable of optimize and jacobian alone")
+    for number in design.variables:
+        if number.quantity == "glass" or (number.surface, number.quantity) == (0, "thickness"):
+            raise BadVariables(f"`vary={joined(vary)}`: {name_of(number)} is a variable of optimize and jacobian alone")
     return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
 
@@ -588,11 +596,11 @@ def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Vari
     where one changes nothing."""
     lens, last = design.lens, sensor(design.lens)
     naming = [word for word in split_words(vary) if "=" not in word and Vary(last, "thickness") in varied(lens, word)]
-    names = [name_of(one) for one in design.variables]
+    names = [name_of(number) for number in design.variables]
     if naming and naming[-1] == "sensor":
         names = ["sensor" if name == f"thickness_{last}" else name for name in names]
     numbers = zip(names, design.variables, design.start.tolist(), strict=True)
-    return tuple(Variable(name, one, start, _unit(lens, one, start)) for name, one, start in numbers)
+    return tuple(Variable(name, number, start, _unit(lens, number, start)) for name, number, start in numbers)
 
 
 def _unit(lens: Lens, number: Vary, start: float) -> float:

@@ -14,6 +14,7 @@ Sources: Nagy and O'Leary, SIAM J. Sci. Comput. 19, 1063 (1998); Denis et al., I
 import bisect
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 import scipy.fft
 import torch
@@ -21,6 +22,9 @@ from torch import Tensor
 
 from raytrace.imaging.image import as_picture, extend
 from raytrace.maths.numerics import varies
+
+#: Called with the number of convolutions done since the last call, and their total.
+Progress: TypeAlias = Callable[[int, int], object]
 
 _RANKS, _SAMPLE = 40, 256  # at most: modes of low rank, and kernels that they are found from
 
@@ -31,7 +35,7 @@ def varying_blur(
     *,
     boundary: str = "reflect",
     tol: float = 0.0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Tensor:
     """Images (..., C, H, W) of pictures (..., C, H, W); kernels: (m, n, C, h, w) of odd h and w, at nodes of a grid.
 
@@ -52,9 +56,9 @@ def varying_blur(
                ((rows, down, kernels.shape[0]), (columns, right, kernels.shape[1]))]  # fmt: skip
     differentiated = varies(picture) or varies(kernels)
     if tol > 0 and not differentiated and _operations_of_rank(large, 1) < _operations_of_patches(large, kernels):
-        modes, shares = _modes(kernels, tol)
-        if modes is not None and _operations_of_rank(large, len(modes)) < _operations_of_patches(large, kernels):
-            return _by_rank(large, modes, shares, weights, progress)
+        low_rank = _modes(kernels, tol)
+        if low_rank and _operations_of_rank(large, len(low_rank[0])) < _operations_of_patches(large, kernels):
+            return _by_rank(large, *low_rank, weights, progress)
     return _by_patches(large, kernels, weights, progress, in_place=not differentiated)
 
 
@@ -86,7 +90,9 @@ def _spans(weights: Tensor) -> list[tuple[int, int, int]]:
     return [(node, int(places[0]), int(places[-1]) + 1) for node, places in lit if len(places)]
 
 
-def _by_patches(large: Tensor, kernels: Tensor, weights: list[Tensor], progress, *, in_place: bool) -> Tensor:
+def _by_patches(
+    large: Tensor, kernels: Tensor, weights: list[Tensor], progress: Progress | None, *, in_place: bool
+) -> Tensor:
     h, w = kernels.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
     total = large.new_zeros(*large.shape[:-2], *shape)
@@ -120,7 +126,7 @@ def _convolved(picture: Tensor, kernel: Tensor) -> Tensor:
     return torch.fft.irfft2(product, s=fast)[..., : shape[0], : shape[1]]
 
 
-def _modes(kernels: Tensor, tol: float) -> tuple[Tensor | None, Tensor | None]:
+def _modes(kernels: Tensor, tol: float) -> tuple[Tensor, Tensor] | None:
     """Kernels u_j (J, h, w) and shares a (J, m, n, C) that give all kernels to `tol`; None where these are too many.
 
     The modes are singular vectors of at most 256 of the kernels, evenly spread; the error is checked for all.
@@ -135,7 +141,7 @@ def _modes(kernels: Tensor, tol: float) -> tuple[Tensor | None, Tensor | None]:
         return bool(((flat - close).abs().sum(-1) <= allowed).all())
 
     if not suffices(len(modes)):
-        return None, None
+        return None
     count = 1 + bisect.bisect_left(range(1, len(modes)), True, key=suffices)
     # As much light as the kernels have.
     scale = flat.sum(-1) / (shares[:, :count] @ modes[:count].sum(-1))
@@ -155,13 +161,13 @@ def _operations_of_patches(large: Tensor, kernels: Tensor) -> float:
     return 2 * m * n * sides[0] * sides[1] * math.log2(sides[0] * sides[1])
 
 
-def _by_rank(large: Tensor, modes: Tensor, shares: Tensor, weights: list[Tensor], progress) -> Tensor:
+def _by_rank(large: Tensor, modes: Tensor, shares: Tensor, weights: list[Tensor], progress: Progress | None) -> Tensor:
     h, w = modes.shape[-2:]
     shape = large.shape[-2] + h - 1, large.shape[-1] + w - 1
     fast = [scipy.fft.next_fast_len(n, real=True) for n in shape]
     channels = []
     for c in range(large.shape[-3]):
-        total = 0.0
+        total = torch.zeros(())
         for mode, share in zip(modes, shares[..., min(c, shares.shape[-1] - 1)], strict=True):
             weight = (weights[0].T @ share @ weights[1]).to(large.dtype)
             spectrum = torch.fft.rfft2(large[..., c, :, :] * weight, s=fast)

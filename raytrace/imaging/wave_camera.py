@@ -10,6 +10,7 @@ import functools
 import math
 import warnings
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import scipy.optimize
@@ -23,7 +24,17 @@ from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_
 from raytrace.maths.result import Result
 from raytrace.maths.sampling import grid
 from raytrace.optimization.least_squares import NoOptimum
-from raytrace.plotting.style import FIELD_COLOURS, GREY, array, new_figure, styled, wavelength_colours
+from raytrace.plotting.style import (
+    FIELD_COLOURS,
+    GREY,
+    Axes,
+    Figure,
+    SubFigure,
+    array,
+    new_figure,
+    styled,
+    wavelength_colours,
+)
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf, psf_by_depth
 from raytrace.wave_optics.element import Element, height
@@ -80,7 +91,7 @@ def kernels(
     return psf_by_depth(scene(elements, config, depths=depths))
 
 
-def transfer(psf: ElementPsf, size: int | tuple[int, int]) -> Tensor:
+def transfer(psf: ElementPsf, size: int | Sequence[int]) -> Tensor:
     """H (D, W, size, size) of kernels normalised by the light through the aperture; light beyond the window is haze."""
     H = transfer_functions(psf.kernel, size)
     haze = torch.zeros_like(H.real)
@@ -267,27 +278,26 @@ class ElementReport(Result):
     initial: "ElementReport | None" = dataclasses.field(default=None, kw_only=True)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Height over the radius, and its difference from a fitted paraboloid where it is many waves high; PSNR over
         depth, kernels over depth and wavelength; of the initial elements, too."""
         figure = new_figure(9.2, 7.0 if self.initial is None else 11.2)
-        top, *bottom = figure.subfigures(
-            2 if self.initial is None else 3, 1, height_ratios=(1, *[1.75] * (1 + (self.initial is not None)))
-        )
+        heights = (1, 1.75) if self.initial is None else (1, 1.75, 1.75)
+        top, *bottom = cast(np.ndarray, figure.subfigures(len(heights), 1, height_ratios=heights))
         radius = self.elements[0].radius
         r = torch.linspace(0, float(radius) * (1 - 1e-9), 4000, dtype=radius.dtype)
         drawn = [(element, FIELD_COLOURS[k % 3], element.glass.name) for k, element in enumerate(self.elements)]
         if self.initial is not None:
             drawn = [(element, GREY, "initial") for element in self.initial.elements] + drawn
-        heights = [1e3 * array(height(element, r, torch.zeros_like(r)).detach()) for element, *_ in drawn]
-        tall = [h for h in heights if np.ptp(h) > _TALL]
+        profiles = [1e3 * array(height(element, r, torch.zeros_like(r)).detach()) for element, *_ in drawn]
+        tall = [h for h in profiles if np.ptp(h) > _TALL]
         profile, *texture, psnrs = top.subplots(1, 3 if tall else 2)
-        r = array(r)
-        for (_, colour, label), h in zip(drawn, heights, strict=True):
+        radii = array(r)
+        for (_, colour, label), h in zip(drawn, profiles, strict=True):
             look = {"lw": 0.9, "color": colour, "label": label}
-            profile.plot(r, h - h.min(), **look)
+            profile.plot(radii, h - h.min(), **look)
             if np.ptp(h) > _TALL:
-                texture[0].plot(r, h - np.polyval(np.polyfit(r * r, h, 1), r * r), **look)
+                texture[0].plot(radii, h - np.polyval(np.polyfit(radii**2, h, 1), radii**2), **look)
         profile.set(xlabel="radius (mm)", ylabel="height (µm)", title="element")
         for panel in texture:
             panel.set(xlabel="radius (mm)", ylabel="height (µm)", title="less the fitted paraboloid")
@@ -308,7 +318,7 @@ class ElementReport(Result):
         return figure
 
 
-def _draw_kernels(figure, psf: ElementPsf, title: str = "PSFs") -> None:
+def _draw_kernels(figure: SubFigure, psf: ElementPsf, title: str = "PSFs") -> None:
     kernels, (D, W) = array(psf.kernel.detach()), psf.kernel.shape[:2]
     axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(psf.wavelengths.tolist())
     half = 1e3 * float(psf.pitch) * kernels.shape[-1] / 2
@@ -328,7 +338,7 @@ def _draw_kernels(figure, psf: ElementPsf, title: str = "PSFs") -> None:
     )
 
 
-def mark_depths(axes, config: WaveCameraConfig) -> None:
+def mark_depths(axes: Axes, config: WaveCameraConfig) -> None:
     """Near objects on the left, even in dioptres."""
     axes.set_xticks([1e3 / depth for depth in config.depths], [depth_text(depth, "∞") for depth in config.depths])
     axes.invert_xaxis()

@@ -13,6 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -52,6 +53,10 @@ class WaveCamera(nn.Module):
     spectrum: S (n, n) of the pictures. v, t: square roots of the weight γ and of the depth in m of the filter "towards"
     the measurement, both trained. network: (B, 1, n, n) -> the same, behind the depth-invariant filter.
     """
+
+    network: nn.Module | None
+    variables: PhaseVariables
+    spectrum: Tensor
 
     def __init__(
         self,
@@ -175,10 +180,15 @@ def best_of_starts(
                 p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
         expected, evaluations = ClosedForm(trial(), config, spectrum), itertools.count(1)
 
-        def error(trial=trial, expected=expected, number=number, evaluations=evaluations) -> Tensor:
-            found = expected(trial())
-            watch(number + 1, next(evaluations), float(found.detach()))
-            return found
+        def error(
+            trial: PhaseVariables = trial,
+            expected: ClosedForm = expected,
+            number: int = number,
+            evaluations: Iterator[int] = evaluations,
+        ) -> Tensor:
+            square = expected(trial())
+            watch(number + 1, next(evaluations), float(square.detach()))
+            return square
 
         lowest = min(minimise_tensors(list(trial.parameters()), error, steps=steps).values)
         if lowest < least:
@@ -241,7 +251,7 @@ def learn_element(
     camera: WaveCamera, pictures: Pictures, settings: DesignSettings, run: Run, *, every: int = 20
 ) -> Iterator[tuple[int, Record]]:
     """The steps of optimisation, one at a time; an unfinished run is resumed."""
-    groups = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
+    groups: list[dict[str, Any]] = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
     if camera.restoration == "towards":
         groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})
     if camera.network is not None:
@@ -274,17 +284,15 @@ def _loss(camera: WaveCamera, pictures: Pictures, settings: DesignSettings, step
         # Every process computes all of it: it is not a sum over samples.
         return camera.expected(camera.variables(draw=draw)) / share.processes
     config, like, n = camera.config, camera.spectrum, camera.spectrum.shape[-1]
-    epoch, place = divmod(step, max(1, len(pictures) * _CROPS // settings.batch))
+    epoch, batch = divmod(step, max(1, len(pictures) * _CROPS // settings.batch))
     samples = []
-    for number in share.of(range(place * settings.batch, (place + 1) * settings.batch)):
+    for number in share.of(range(batch * settings.batch, (batch + 1) * settings.batch)):
         sample = number % (len(pictures) * _CROPS)
         patch = crop(pictures, sample, epoch=epoch, size=n // 2, crops=_CROPS, seed=settings.seed)
         random = draws(settings.seed, epoch, number, _SAMPLE)
-        depth = int(random.integers(len(config.depths)))
-        noise = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
-        samples.append(
-            (torch.as_tensor(mirrored(patch)).to(like), torch.tensor(depth), torch.as_tensor(noise).to(like))
-        )
+        place = torch.tensor(int(random.integers(len(config.depths))))
+        normal = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
+        samples.append((torch.as_tensor(mirrored(patch)).to(like), place, torch.as_tensor(normal).to(like)))
     picture, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
     estimate = camera(picture, depth, noise, draw=draw)
     return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch
