@@ -134,7 +134,7 @@ class Result:
         """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}
 
-    def draw(self, **options: Any) -> "Figure":
+    def draw(self, *arguments: Any, **options: Any) -> "Figure":
         """The figure of `plot`. Raises TypeError: no figure."""
         raise TypeError(f"{type(self).__name__} has no figure")
 
