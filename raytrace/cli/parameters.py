@@ -32,7 +32,8 @@ class Parameter(NamedTuple):
 @functools.cache
 def parameters_of(verb: str) -> dict[str, Parameter]:
     """The parameters of a public function by their names."""
-    function, constants = _definition(verb, raytrace.PUBLIC[verb].partition(":")[0])
+    module, _, defined = raytrace.PUBLIC[verb].partition(":")
+    function, constants = _definition(defined or verb, module)
     arguments = function.args
     given = [None] * (len(arguments.args) - len(arguments.defaults)) + [*arguments.defaults, *arguments.kw_defaults]
     every = [*arguments.args, *arguments.kwonlyargs]
