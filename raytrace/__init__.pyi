@@ -112,8 +112,8 @@ from raytrace.system.parameter_paths import BadVariables as BadVariables
 from raytrace.system.parameter_paths import UnknownNumber as UnknownNumber
 from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
-from raytrace.tolerancing.analysis import tolerance_analysis as tolerance
-from raytrace.tolerancing.grades import tolerance_table as tolerances
+from raytrace.tolerancing.analysis import tolerance as tolerance
+from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.jacobian import NoDerivatives as NoDerivatives
 from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.table import BadTolerance as BadTolerance
