@@ -56,6 +56,8 @@ def _definition(name: str, module: str) -> tuple[ast.FunctionDef, dict]:
         if isinstance(node, ast.ImportFrom) and any((alias.asname or alias.name) == name for alias in node.names):
             return _definition(name, node.module.removeprefix("raytrace."))
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            if node.targets[0].id == name and isinstance(node.value, ast.Name):  # a former name
+                return _definition(node.value.id, module)
             constants[node.targets[0].id] = _evaluated(node.value, constants)
     raise LookupError(f"{name} is not defined in {path}")
 

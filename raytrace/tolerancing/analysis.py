@@ -499,7 +499,8 @@ def tolerance_analysis(
 
 
 #: Former names.
-Toleranced, tolerance = ToleranceAnalysis, tolerance_analysis
+Toleranced = ToleranceAnalysis
+tolerance = tolerance_analysis
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:
