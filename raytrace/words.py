@@ -6,7 +6,9 @@ import inspect
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from numbers import Real
 from pathlib import Path
 
@@ -44,7 +46,7 @@ def both_spellings(method: Callable) -> Callable:
     names = tuple(inspect.signature(method).parameters)[1:]
 
     @functools.wraps(method)
-    def read(self, *values, **options):
+    def read(self: object, *values: object, **options: object) -> object:
         if values:
             raise TypeError(f"{method.__qualname__}: {nameless(values[0], names)}")
         known = {known_option(method.__qualname__, word, names, options): value for word, value in options.items()}
@@ -72,6 +74,27 @@ def nameless(value: object, names: Iterable[str]) -> str:
     names = [*names]
     where = f"write name=value (options: {', '.join(names)})" if names else "it takes no further value; leave it out"
     return f"{named_value(value)} is given without a name; {where}"
+
+
+_flags: ContextVar[Mapping[str, str]] = ContextVar("flags")
+
+
+@contextmanager
+def in_command(flags: Mapping[str, str]) -> Iterator[None]:
+    """Within the block, messages name options as a command spells them; flags: by parameter, {"fields": "--field"}."""
+    token = _flags.set(flags)
+    try:
+        yield
+    finally:
+        _flags.reset(token)
+
+
+def option(name: str, value: object = "") -> str:
+    """An option as a message names it: `ray_aiming=real` in Python, --ray-aiming real in a command that has it."""
+    flag, text = _flags.get({}).get(name), str(value)
+    if flag is None:
+        return f"`{name}={text}`" if text else f"`{name}`"
+    return f"{flag} {text}" if text else flag
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -7,6 +7,9 @@ import io
 import json
 import math
 import re
+import subprocess
+import sys
+import typing
 from collections import defaultdict
 from pathlib import Path
 
@@ -17,13 +20,17 @@ import torch
 
 import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
-from raytrace.cli import build_parser
-from raytrace.cli.commands import COMMANDS
-from raytrace.cli.parameters import entries, parameters_of
-from raytrace.cli.run import find_lens
+from raytrace.cli import build_parser, options
+from raytrace.cli.commands import COMMANDS, WAVE_COMMANDS
+from raytrace.cli.run import RUNNER_OPTIONS, find_lens
 from raytrace.cli.types import PICTURES, picture_file
+from raytrace.imaging.sensor import PATTERNS
 from raytrace.io import read_lens
+from raytrace.io.pictures import read_depth
 from raytrace.maths.sampling import hexapolar
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_of_options
+from raytrace.psf_models import MODELS, Execution
+from raytrace.tolerancing.grades import GRADES
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
 from raytrace.tracing.spot import arrivals
 from raytrace.words import did_you_mean
@@ -325,37 +332,100 @@ def test_axes_do_not_magnify_rounding(tmp_path):
     assert off_line.plot().axes[0].lines[0].get_marker() == "o"  # few fields: points are seen
 
 
-# -- options from signatures ------------------------------------------------------------------------------------------
+# -- the table of options and the functions ----------------------------------------------------------------------------
+
+#: Parameters without an option, and why.
+NO_OPTION = {
+    **dict.fromkeys(("progress", "watch", "share"), "given by the runner"),
+    **dict.fromkeys(("path", "catalogs"), "files, by LENS and --catalog"),
+    **dict.fromkeys(("lens", "pupil", "grid", "elements", "tolerances"), "an object; LENS is the lens"),
+    **dict.fromkeys(("execution", "as_built", "merit"), "an object, whose fields have options"),
+    "window": "the kernels of a picture of the whole field, in Python",
+}
+#: Functions whose parameters are options of a command, by a parameter of its public function that holds them.
+PARTS = {
+    "merit": (merit_of_options, DefaultMerit, Merit.of),
+    "as_built": (rt.AsBuilt,),
+    "sensor": (rt.Sensor, rt.Sensor.capture, read_depth),
+    "model": (rt.DRT, rt.Paraxial),
+    "execution": (Execution,),
+}
+#: Options of the runner of one command.
+OF_ONE_RUN = {"render": {"png_bits", "raw"}}
+
+VERBS = [command for command in (*COMMANDS, *WAVE_COMMANDS) if command.verb in rt.PUBLIC]
 
 
-@pytest.mark.parametrize("command", [command.name for command in COMMANDS if command.verb in rt.PUBLIC])
-def test_parameters_read_from_the_source_are_those_of_the_function(command):
-    verb = command.replace("-", "_")
-    expected, read = inspect.signature(getattr(rt, verb)).parameters, parameters_of(verb)
-    assert [*read] == [*expected]
-    for name, parameter in read.items():
-        if parameter.default is not None:  # one that is no constant in the source is not read
-            assert parameter.default == expected[name].default
-
-
-def test_entries_of_a_docstring_are_help_texts():
-    text = """A sum.
-
-    first, second: numbers, of `first` more
-    often. The rest is no help. third: "a" or "b";
-    fourth: mm."""
-    assert entries(inspect.cleandoc(text), ["first", "second", "third", "fourth"]) == {
-        **dict.fromkeys(("first", "second"), "numbers, of --first more often"),
-        "third": "a or b",
-        "fourth": "mm",
-    }
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_option_has_a_help_text(command):
+def rows(command):
+    """The actions of a command by their destination, help aside."""
     parser = argparse.ArgumentParser(add_help=False)
-    command.add_arguments(parser)
-    assert all(action.help for action in parser._actions if not isinstance(action, argparse._SubParsersAction))
+    options.add(parser, command.options)
+    return {action.dest: action for action in parser._actions}
+
+
+def parameters(*functions):
+    return {name for function in functions for name in inspect.signature(function).parameters}
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_options_are_the_parameters_of_the_function(command):
+    keywords, actions = inspect.signature(getattr(rt, command.verb)).parameters, rows(command)
+    parts = {name for part, functions in PARTS.items() if part in keywords for name in parameters(*functions)}
+    names = {name for name in actions if not name.startswith("plot_")} - OF_ONE_RUN.get(command.name, set())
+    assert names - {*RUNNER_OPTIONS} <= {*keywords} | parts
+    assert {*keywords} - {*actions} <= {*NO_OPTION}
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_defaults_of_options_are_those_of_the_function(command):
+    actions = rows(command)
+    for name, parameter in inspect.signature(getattr(rt, command.verb)).parameters.items():
+        if name in actions and name not in RUNNER_OPTIONS:
+            default, stated = parameter.default, actions[name].default
+            if stated is None and default not in (None, inspect.Parameter.empty):  # the function's own
+                assert "default" in actions[name].help or name in ("fields", "wavelengths"), name
+            elif stated is not None:
+                assert stated == default, name
+
+
+def test_choices_are_the_rows_of_the_tables_of_the_package():
+    assert (*MODELS,) == options.MODELS
+    assert (*GRADES,) == options.GRADES
+    by_name = {command.name: rows(command) for command in COMMANDS}
+    assert by_name["optimize"]["merit"].choices == (*KINDS,)
+    assert by_name["render"]["mosaic"].choices == ("none", *PATTERNS)
+
+
+def literals(annotation):
+    """The choices of an annotation Literal[…], also within a union."""
+    parts = typing.get_args(annotation)
+    return parts if typing.get_origin(annotation) is typing.Literal else sum(map(literals, parts), ())
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_choices_are_those_of_the_annotation(command):
+    actions = rows(command)
+    for name, parameter in inspect.signature(getattr(rt, command.verb)).parameters.items():
+        if name in actions and (choices := literals(parameter.annotation)):
+            assert (*actions[name].choices,) == choices, name
+
+
+def test_the_command_line_reads_no_source_and_imports_no_function():
+    """Docstrings and annotations of the functions cannot change a command: their modules are neither loaded nor read."""
+    code = """
+import builtins, io, pathlib, sys
+from raytrace.cli import build_parser, commands
+builtins.open = io.open = pathlib.Path.read_text = None
+build_parser()
+print(*sorted(name for name in sys.modules if name.startswith("raytrace.") and not name.startswith("raytrace.cli.")))
+"""
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert loaded == ["raytrace.budget", "raytrace.cli", "raytrace.files", "raytrace.settings", "raytrace.words"]
+
+
+@pytest.mark.parametrize("command", (*COMMANDS, *WAVE_COMMANDS), ids=lambda command: command.name)
+def test_every_option_has_a_help_text(command):
+    assert all(action.help for action in rows(command).values())
 
 
 def test_options_of_other_commands_are_not_built():
