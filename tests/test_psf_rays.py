@@ -10,10 +10,12 @@ from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
 from raytrace.maths.sampling import Grid, grid, sobol
+from raytrace.psf_models import DRT, Gaussian, Wave, psf
 from raytrace.psf_models.drt import below_edge, histogram, kernels_of_rays, splat, splat_cells, splat_smooth, trace_fans
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import beam_share, scene
+from raytrace.tracing.spot import image_rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 
@@ -201,3 +203,25 @@ def test_cells_of_a_focus_smaller_than_a_pixel_are_finite():
     assert float(image.detach()[1, 1]) == pytest.approx(1.0, abs=1e-14)
     (slope,) = torch.autograd.grad(image.square().sum(), points)
     assert torch.isfinite(slope).all()
+
+
+def test_pupil_points_are_the_rays_of_a_kernel():
+    """As many Sobol rays are those of their number; a Gaussian has their centroid and covariance."""
+    lens = read_lens("double_gauss").at(ray_aiming="real", wavelengths=(0.48, 0.53, 0.62))
+    about = {"fields": [0, 10], "object_distances": [2e4, 3e4]}
+    points = sobol(64)[0]
+    of_points, of_number = (psf(lens, DRT(rays=rays), **about) for rays in (points, 64))
+    assert torch.equal(of_points.kernel, of_number.kernel)
+    gaussian = psf(lens, Gaussian(rays=points), **about)
+    for k, distance in enumerate(about["object_distances"]):
+        rays = image_rays(lens.at(object_distance=distance), points, fields=number([[0.0, 0.0], [0.0, 10.0]]))
+        places = rays.position[:2].expand(2, 2, 3, -1).flatten(2, 3)  # all wavelengths have as many rays
+        weights = lens.wavelength_weights.repeat_interleave(64) / (64 * lens.wavelength_weights.sum())
+        mean = (places * weights).sum(-1)
+        assert torch.allclose(gaussian.centroid[:, k], mean, rtol=0, atol=1e-12)
+        square = ((places - mean[..., None]) ** 2 * weights).sum(-1)
+        assert torch.allclose(gaussian.covariance[::2, k], square, rtol=1e-9, atol=1e-15)
+    with pytest.raises(ValueError, match="not pupil points"):
+        psf(lens, Wave(rays=points), **about)
+    with pytest.raises(ValueError, match=r"pupil points \(2, P\)"):
+        psf(lens, DRT(rays=points[0]), **about)

@@ -35,6 +35,8 @@ from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
 from raytrace.tracing.scene import Scene, beam_share, symmetry, trace_apertures, trace_scene
 
+_RAY_WIDTH = 0.25  # half width in pixels of an independent ray, for a derivative
+
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
     """Bilinear deposition: each point shares its weight between the four nearest pixel centres.
@@ -226,7 +228,7 @@ def kernels_of_rays(
     order: int = 4,
     rays: int | None = None,
     sampling: Callable[..., tuple[Tensor, Tensor]] = sobol,
-    width: float = 0.25,
+    width: float = _RAY_WIDTH,
 ) -> Kernels:
     """PSFs of traced rays, without the polynomial map; differentiable in the lens, the sensor distance and the grid.
 
@@ -237,8 +239,8 @@ def kernels_of_rays(
     if rays is None:
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
     like = scene.lens.surfaces[-2].thickness
-    points, weights = sampling(rays, dtype=like.dtype, device=like.device)
-    return dataclasses.replace(kernels_of_points(scene, grid, points, weights, width=width), rays=rays)
+    points, _ = sampling(rays, dtype=like.dtype, device=like.device)
+    return dataclasses.replace(kernels_of_points(scene, grid, points, width=width), rays=rays)
 
 
 def trace_fans(scene: Scene, order: int) -> Fans:
@@ -383,10 +385,10 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(weights.sum((-2, -1)) > 0, centroid, 0.0), covariance
 
 
-def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *, width: float) -> Kernels:
-    """Kernels of independent rays through pupil points (2, P), by their weights (P,), shares of the light."""
+def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, *, width: float = _RAY_WIDTH) -> Kernels:
+    """Kernels of independent rays through pupil points (2, P), all of one weight."""
     traced = trace_scene(scene, disc)
-    energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
+    energy = torch.where(traced.valid, 1 / disc.shape[1], 0.0).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]

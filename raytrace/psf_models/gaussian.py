@@ -399,6 +399,21 @@ def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     return _kernels(scene, grid, order)[2]
 
 
+def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
+    """Gaussians of the rays through pupil points (2, P), all of one weight: their centroid and covariance, not those of
+    all light."""
+    traced = trace_scene(scene, points)
+    arrives = torch.where(traced.valid, 1 / points.shape[1], 0.0).expand(*scene.shape, -1)
+    centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
+    # Points with their mirror images in x have no covariance xy but for rounding, which would cost a quadrature.
+    mirrored = points * points.new_tensor([[-1.0], [1.0]])
+    distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
+    is_mirrored = symmetry(scene) != "none" and bool((distance < 1e-12).all())
+    pixels = gaussian_pixels(grid, centroid, covariance[::2] if is_mirrored else covariance)
+    energy = arrives.sum(-1) * beam_share(scene)
+    return Kernels(energy[..., None, None] * pixels, grid, centroid, covariance, points.shape[1])
+
+
 def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kernels]:
     """The light, the share of every pixel in the light that arrives, and the kernels."""
     fold = symmetry(scene)

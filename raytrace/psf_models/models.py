@@ -62,18 +62,24 @@ class Fourier:
 class Gaussian:
     """A Gaussian of the centroid and covariance of traced rays.
 
-    rays: at most so many per kernel; order: instead, Gauss rings, 2, 3, 4, 5, 6, 8, 10, 12, 16 or 24, for loops.
+    rays: at most so many per kernel, or their pupil points (2, P), all of one weight: a Gaussian of twelve rays has
+    their centroid and covariance, not those of all light; order: instead, Gauss rings, 2, 3, 4, 5, 6, 8, 10, 12, 16 or
+    24, for loops.
     """
 
-    rays: int | None = None
+    rays: int | Tensor | None = None
     order: int | None = None
 
 
 @value
 class DRT:
-    """All traced rays: geometric optics. rays: independent Sobol rays per kernel; order: instead, 0 … 10, for loops."""
+    """All traced rays: geometric optics.
 
-    rays: int | None = None
+    rays: independent Sobol rays per kernel, or their pupil points (2, P), all of one weight; order: instead, 0 … 10,
+    for loops.
+    """
+
+    rays: int | Tensor | None = None
     order: int | None = None
 
 
@@ -113,6 +119,7 @@ class Model:
         `kernels`.
     lean: `kernels` without the residual, where that costs time.
     plain: (scene, grid, rays=…) -> Kernels of independent rays, where the model has such.
+    of_points: (scene, grid, points) -> Kernels of the rays through pupil points (2, P), where the model has such.
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
         alone and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
@@ -138,6 +145,7 @@ class Model:
     parameters: type
     lean: Callable[..., Kernels] | None = None
     plain: Callable[..., Kernels] | None = None
+    of_points: Callable[[Scene, Grid, Tensor], Kernels] | None = None
     traces: bool = True
     waves: bool = False
     is_rung: bool = False
@@ -168,14 +176,15 @@ _ROWS = (
     # that of the next, so the error is proven.
     Model(
         "gaussian", "Gaussian DRT", gaussian.kernels, (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), Gaussian,
-        lean=gaussian.kernels_alone, is_rung=True, row=1, compared={"tol": 1e-3},
+        lean=gaussian.kernels_alone, of_points=gaussian.kernels_of_points, is_rung=True, row=1, compared={"tol": 1e-3},
         by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
     ),
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
-        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, is_rung=True, row=0, in_common=True,
-        compared={"model": DRT(rays=256)}, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
+        "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, of_points=drt.kernels_of_points,
+        is_rung=True, row=0, in_common=True, compared={"model": DRT(rays=256)},
+        first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
     Model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_rung=True, by_field=True, row=4, **_OF_WAVES),
@@ -270,6 +279,7 @@ def psf(
             raise ValueError(f"{option} {word!r} is not known; expected {', '.join(words)}")
     parameters = MODELS[name].parameters() if isinstance(model, str) and name != "auto" else model
     order, rays = (getattr(parameters, number, None) for number in ("order", "rays"))
+    points = rays if isinstance(rays, Tensor) else None
     for wrong, message in (
         (tol is not None and rays is not None, "tol and rays exclude each other: tol chooses the number of rays"),
         (
@@ -277,7 +287,15 @@ def psf(
             "an order fixes the amount of work: it excludes tol and rays",
         ),
         (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
-        (rays is not None and (rays < 1 or rays % 1), f"rays {rays}: expected a whole number above 0"),
+        (
+            rays is not None and points is None and (rays < 1 or rays % 1),
+            f"rays {rays}: expected a whole number above 0",
+        ),
+        (
+            points is not None and (points.dim() != 2 or len(points) != 2 or not points.numel()),
+            f"rays of shape {tuple(getattr(rays, 'shape', ()))}: expected pupil points (2, P), or their number",
+        ),
+        (points is not None and MODELS[name].of_points is None, f"{name} takes a number of rays, not pupil points"),
         (grid is not None and (pixel, size) != (None, None), "a grid has a pixel and a size: leave these out"),
         (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
     ):
@@ -346,16 +364,16 @@ def psf(
     # A choice by an estimate is made for each object distance, or lens, alone: no PSF depends on its neighbours.
     # A fixed amount of work is done together, for finite distances and infinite ones apart.
     infinite, numbers = torch.isinf(distances), torch.arange(len(distances), device=distances.device)
-    is_fixed = order is not None or (rays is not None and MODELS[name].plain is not None)
+    is_fixed = order is not None or points is not None or (rays is not None and MODELS[name].plain is not None)
     groups = [numbers[~infinite], numbers[infinite]] if is_fixed else list(numbers.split(1))
     groups = [group for group in groups if len(group)]
     with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():
         psfs = _merged([compute(group) for group in groups], torch.cat(groups).argsort())
-    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    trials = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
         trial = with_object_distance(lens if lenses is None else one_lens(lens, 0), distances[0].detach())
-        failures = ray_failures(trial, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+        failures = ray_failures(trial, trials, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
         reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
         raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
     if normalise == "window":
@@ -371,7 +389,7 @@ def psf(
             where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
             at = where if len(distances) > 1 else ""
             trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
-            warn_of_failures(trial, points, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+            warn_of_failures(trial, trials, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
     return dataclasses.replace(
         psfs,
         lens=lens,
@@ -408,6 +426,8 @@ def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution)
         return functools.partial(by_order, model=model, order=parameters.order)
     if getattr(parameters, "rays", None) is None:
         return functools.partial(by_tolerance, model=model, tol=tol)
+    if isinstance(parameters.rays, Tensor):
+        return functools.partial(by_points, model=model, points=parameters.rays)
     rays = int(parameters.rays)
     if execution.max_bytes is None or model.plain is None:
         return functools.partial(by_rays, model=model, count=rays)
@@ -490,6 +510,11 @@ def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Mode
     if torch.is_grad_enabled() and any(varies(number) for number in numbers):
         psfs = by_order(batch, pixels, weights, model, order)
     return dataclasses.replace(psfs, error=error, residual=residual, reason=reason)
+
+
+def by_points(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, points: Tensor) -> Psf:
+    """The kernels of the rays through pupil points (2, P), without error estimate."""
+    return polychromatic(model.of_points(batch, pixels, points.to(batch.fields)), weights, model.name)
 
 
 def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, count: int) -> Psf:
