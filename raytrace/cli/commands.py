@@ -751,7 +751,7 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         row("grade", "tolerances of a published grade instead of the file's"),
         row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
             "those of the file or the grade, and index=0 leaves one out", default=""),
-        Option("criterion", None, "NAME", "rms, the RMS spot radius in µm over fields and wavelengths by their "
+        Option("criterion", help="rms, the RMS spot radius in µm over fields and wavelengths by their "
             "weights, each field about the centroid of its light, of an afocal lens that of angle, the RMS angle in "
             "mrad of the rays; wavefront, the RMS wavefront in waves less mean and tilt; mtf@30, the MTF of "
             "diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; psf, the change of the "
