@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -65,7 +65,11 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     rays = math.prod((pupil_points, *counts.values()))
     factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     what = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
-    afford(RAY_BYTES * rays, what, helps="ask for fewer `fields`, `wavelengths` or points of the pupil")
+    afford(
+        RAY_BYTES * rays,
+        what,
+        helps=f"ask for fewer {option('fields')}, {option('wavelengths')} or points of the pupil",
+    )
 
 
 def forewarn(seconds: float, what: str, *, helps: str) -> None:

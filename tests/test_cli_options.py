@@ -1,6 +1,7 @@
 """Options of the commands: one name has one meaning; options with several values; suggestions for misspelt options."""
 
 import argparse
+import ast
 import csv
 import inspect
 import io
@@ -33,7 +34,7 @@ from raytrace.psf_models import MODELS, Execution
 from raytrace.tolerancing.grades import GRADES
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
 from raytrace.tracing.spot import arrivals
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, in_command, option
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
@@ -447,3 +448,35 @@ def test_the_table_of_an_analysis_is_written_by_o(command):
     assert [float(row["S1"]) for row in rows] == expected["S1"].tolist()
     assert command("distortion", "singlet", "--field", "1", "-o", "distortion.json")[0] == 0
     assert json.loads(Path("distortion.json").read_text()) == rt.distortion("singlet", fields=[1]).document()
+
+
+def test_an_option_is_named_as_its_reader_writes_it():
+    assert option("ray_aiming", "real") == "`ray_aiming=real`"
+    with in_command({"ray_aiming": "--ray-aiming", "fields": "--field"}):
+        assert option("ray_aiming", "real") == "--ray-aiming real"
+        assert option("fields") == "--field"
+        assert option("tol", 0.1) == "`tol=0.1`"  # not an option of that command
+    assert option("fields") == "`fields`"
+
+
+def sentences(tree):
+    """Texts of a module, docstrings aside, with their lines."""
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value, node.lineno
+
+
+def test_messages_name_options_by_a_function():
+    """`words.option("fields")` is --field in a command, and `fields` in Python."""
+    package, names = Path(rt.__file__).parent, {name for command in COMMANDS for name in rows(command)}
+    others = ("cli/commands.py", "optimization/operands/", "imaging/camera.py", "io/__init__.py", "bench/")
+    offenders = [
+        f"{path.relative_to(package)}:{line}: `{word}`"
+        for path in sorted(package.rglob("*.py"))
+        if not str(path.relative_to(package)).startswith(others)
+        for text, line in sentences(ast.parse(path.read_text("utf-8")))
+        for word in re.findall(r"`(\w+)(?:=[^`]*)?`", text)
+        if word in names
+    ]
+    assert not offenders, "\n".join(offenders)

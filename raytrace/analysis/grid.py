@@ -21,6 +21,7 @@ from raytrace.plotting.style import GREY, array, field_colour, new_figure, numbe
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
 from raytrace.tracing.spot import chief_points
+from raytrace.words import option
 
 _NEAR_AXIS = 1e-4  # of the largest field: its rays give the scale of the image; they leave 1e-8 of the distortion
 
@@ -115,7 +116,11 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     refuse_axis(largest)
     warn_of_filling(lens, largest)
     rays = points**2 * len(lens.wavelengths)
-    afford(RAY_BYTES * rays, f"{rays:,} chief rays of {points:,} × {points:,} objects", helps="ask for fewer `points`")
+    afford(
+        RAY_BYTES * rays,
+        f"{rays:,} chief rays of {points:,} × {points:,} objects",
+        helps=f"ask for fewer {option('points')}",
+    )
     described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)

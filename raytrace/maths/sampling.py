@@ -13,6 +13,7 @@ from torch import Tensor
 
 from raytrace.budget import afford
 from raytrace.maths.numerics import value
+from raytrace.words import option
 
 _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
 _POINT_BYTES = 64  # of a point and its weight, with what it takes to make them
@@ -22,12 +23,12 @@ def _at_least_one(rule: str, **sizes: float) -> None:
     """Raise ValueError for a rule without points."""
     for name, size in sizes.items():
         if not size >= 1:
-            raise ValueError(f"{rule}: `{name}` is {size}; expected 1 or more")
+            raise ValueError(f"{rule}: {option(name)} is {size}; expected 1 or more")
 
 
-def _afford(count: float, what: str, option: str) -> None:
+def _afford(count: float, what: str, size: str) -> None:
     """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
-    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer `{option}`")
+    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer {option(size)}")
 
 
 def gauss_rings(
@@ -190,7 +191,8 @@ def sampled(
     wrong = "points" if counted == "rings" else "rings"
     if given[wrong] is not None:
         takers = ", ".join(name for name, (_, what, _) in SAMPLINGS.items() if what == wrong)
-        raise ValueError(f"`{wrong}` belongs to `sampling={takers}`; {sampling} takes `{counted}`")
+        takers = option("sampling", takers)
+        raise ValueError(f"{option(wrong)} belongs to {takers}; {sampling} takes {option(counted)}")
     own = {"seed": seed} if rule in (sobol, random) else {}
     return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)
 

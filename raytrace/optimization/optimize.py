@@ -72,7 +72,7 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, option
 
 # -- conditions: what is required, and what is reached -----------------------------------------------------------------
 
@@ -151,7 +151,10 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     named = [_condition_text(problem, number) for number in conflict.numbers]
     values = {condition.words: condition.reached for condition in conditions_at(problem, x)}
     listed = ", ".join(f"{name} (now {values[name]:.6g})" if name in values else name for name in named)
-    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
+    raise NoProblem(
+        f"{option('hold')}: {listed}: {conflict.words(problem)}; change {option('hold')}, {option('vary')} or "
+        f"{option('bounds')}"
+    )
 
 
 # -- values ------------------------------------------------------------------------------------------------------------
@@ -713,7 +716,7 @@ class Optimized(Result):
         low = int((self.values_before[rows].abs() < _UNSHARP).sum())
         if 2 * low <= len(rows):
             return []
-        hint = "minimise `merit=spot` first, then the MTF from its result"
+        hint = f"minimise {option('merit', 'spot')} first, then the MTF from its result"
         return [f"  {low} of {len(rows)} rows of the MTF start below {_UNSHARP:g}, where it hardly has a slope: {hint}"]
 
     def _lengths(self) -> Table:
@@ -904,16 +907,16 @@ def optimize(
     for path, suffixes in ((log, LOGS), (checkpoint, CHECKPOINTS)):
         if path is not None:
             check_output(path, suffixes)
-    for option, path in (("checkpoint", checkpoint), ("resume", resume)):
+    for name, path in (("checkpoint", checkpoint), ("resume", resume)):
         if None not in (log, path) and os.path.realpath(log) == os.path.realpath(path):
-            raise ValueError(f"{log}: `log` and `{option}` are one file; give them two")
+            raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
     model, glasses = without_glass(design_variables(lens, vary), vary)
     names = tuple(name_of(one) for one in model.variables)
     lower, upper = bounds_of(model.lens, model.variables, bounds)
     for name, least, most in zip(names, lower, upper, strict=True):
         if not least <= most:
-            raise NoProblem(f"`bounds` of {name}: from {least:g} to {most:g} there is nothing")
+            raise NoProblem(f"{option('bounds')} of {name}: from {least:g} to {most:g} there is nothing")
     settings = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles}
     of = {**identity(lens), "variables": list(names), "solves": digest(repr(model.solves)), "paths": paths}
     of |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
@@ -923,16 +926,20 @@ def optimize(
 
     if callable(merit):
         if glasses:
-            raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
+            raise NoProblem(f"{option('vary', 'glass')} goes with a merit of rows: make the function a row")
         if hold:
-            raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
+            raise NoProblem(
+                f"{option('hold')} goes with a merit of rows: of a function give {option('bounds')}, or make it a row"
+            )
         if as_built is not None:
-            raise NoProblem("`as_built` goes with a merit of rows: add `as_built.of(lens).expected` to the function")
+            raise NoProblem(
+                f"{option('as_built')} goes with a merit of rows: add `as_built.of(lens).expected` to the function"
+            )
         of["merit"] = getattr(merit, "__qualname__", type(merit).__name__)
         function = FunctionMerit(model, merit, stored().evaluated)
         start = np.clip(model.start, lower, upper)
         if not names:
-            raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
+            raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
         bar, seen = progress and progress(cycles, "cycle"), watch and (lambda one, x: watch(one, _lens_at(model, x)))
         with _Observer(log, Checkpoint(checkpoint, of, names), bar, None, seen) as observer:
             before = function(model.start)[0]

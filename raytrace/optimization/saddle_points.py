@@ -44,6 +44,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
+from raytrace.words import option
 
 _SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 _NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, for second derivatives
@@ -57,15 +58,15 @@ def surfaces_of(free: DesignVariables, named: Sequence[int] = ()) -> tuple[int, 
     """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
-        raise NoProblem("`insert`: the lens has several configurations; take one of them")
+        raise NoProblem(f"{option('insert')}: the lens has several configurations; take one of them")
     if not named:
         found = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
         if not found:
-            raise NoProblem("`insert`: no spherical surface between glass and air whose curvature varies")
+            raise NoProblem(f"{option('insert')}: no spherical surface between glass and air whose curvature varies")
         return found
     for k in named:
         if objection := _objection(free, k):
-            raise NoProblem(f"`insert`: surface {k} {objection}")
+            raise NoProblem(f"{option('insert')}: surface {k} {objection}")
     return tuple(dict.fromkeys(named))
 
 
@@ -81,7 +82,7 @@ def _objection(free: DesignVariables, k: int) -> str:
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
         return "is not between glass and air"
     varies = any((one.surface, one.quantity) == (k, "curvature") for one in free.variables)
-    return "" if varies else "has a curvature that does not vary: name it by `vary`"
+    return "" if varies else f"has a curvature that does not vary: name it by {option('vary')}"
 
 
 # -- the lens with one element more ------------------------------------------------------------------------------------
@@ -310,7 +311,9 @@ class Insertion:
         until = self.journal.until
         own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
         if not own.is_valid:
-            raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
+            raise NoProblem(
+                f"{option('insert')}: the lens itself loses rays or misses what is held; search without insert first"
+            )
         lens, work = model.lens_at(own.x), own.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:

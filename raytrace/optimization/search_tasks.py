@@ -31,7 +31,7 @@ from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, 
 from raytrace.system.identity import identity, unlike
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import sensor
-from raytrace.words import RaytraceError, calling_level
+from raytrace.words import RaytraceError, calling_level, option
 
 # -- the journal -------------------------------------------------------------------------------------------------------
 
@@ -73,7 +73,7 @@ _JOURNAL = Kind(
     BadSearch,
     "it keeps no search: name a new folder",
     BadSearch,
-    "`folder`: {path} keeps a search of {difference}; name a new folder",
+    "{path} keeps a search of {difference}; name a new folder",
     unlike,
     "the search continues, but cannot resume from here",
 )
@@ -286,7 +286,9 @@ def space_of(
     upper = np.where(np.isfinite(bounds[1]), bounds[1], [high for _, high in ends])
     for one, least, most in zip(model.variables, lower, upper, strict=True):
         if not least <= most:
-            raise NoProblem(f"`bounds` of {one.quantity}_{one.surface}: from {least:g} to {most:g} there is nothing")
+            raise NoProblem(
+                f"{option('bounds')} of {one.quantity}_{one.surface}: from {least:g} to {most:g} there is nothing"
+            )
     low, high = lower.copy(), upper.copy()
     for k, one in enumerate(model.variables):
         if one.quantity == "curvature" and length is not None:
@@ -304,7 +306,7 @@ def _ends(model: DesignVariables, one: Vary, length: float | None, glass: Range,
     if one.quantity not in ("curvature", "thickness") or one.surface == 0:
         return -np.inf, np.inf
     if length is None:
-        raise NoProblem("how large the lens is to be is not known: `hold` its focal length, as efl=50")
+        raise NoProblem(f"how large the lens is to be is not known: {option('hold')} its focal length, as efl=50")
     if one.quantity == "curvature":
         aperture = model.lens.aperture
         if aperture.kind == "entrance_pupil_diameter":

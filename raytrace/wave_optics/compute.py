@@ -31,7 +31,7 @@ from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture, is_round
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, option
 
 _KEPT = 8  # sums that a memo keeps
 
@@ -274,8 +274,10 @@ def wave_psf(
         fixed = {"glass": glass, "index": index, "pitch": pitch, "span": span, "levels": levels}
         fixed |= {"design_wavelength": design_wavelength}
         fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, own) else aperture}
-        if option := next((option for option, number in fixed.items() if number is not None), ""):
-            raise ValueError(f"`{option}` belongs to an element by name or from a file; an Element has its own")
+        if parameter := next((name for name, number in fixed.items() if number is not None), ""):
+            raise ValueError(
+                f"{option(parameter)} belongs to an element by name or from a file; an Element has its own"
+            )
         name = " + ".join(part.kind.words for part in parts)
     for glass in {id(part.glass.coefficients): part.glass for part in parts}.values():
         check_unit(torch.tensor(wavelengths), [glass])
@@ -323,25 +325,25 @@ def elements(
     name = str(element)
     if name in BASELINES:
         of_maps = {"glass": glass, "index": index, "pitch": pitch, "span": span}
-        if option := next((option for option, number in of_maps.items() if number is not None), ""):
-            raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
+        if parameter := next((word for word, number in of_maps.items() if number is not None), ""):
+            raise ValueError(f"{option(parameter)} belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
-            raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
+            raise ValueError(f"{option('levels')}: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
         distances = {"radius": 0.5 * aperture, "sensor": sensor, "focus": focus}
         conditions = aim(**distances, wavelength=design_wavelength or DESIGN, exact=exact)
         return baseline(name, conditions, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in ELEMENT_FORMATS:
         raise ValueError(
-            f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
+            f"{option('element', name)}: neither a named element ({', '.join(BASELINES)}) nor a height map "
             f"({', '.join(FORMATS)}) nor a smooth element ({SMOOTH}){did_you_mean(name, BASELINES)}"
         )
     if index is not None:
         if glass:
-            raise ValueError("`glass` and `index` exclude each other: both specify the material")
+            raise ValueError(f"{option('glass')} and {option('index')} exclude each other: both specify the material")
         try:
             glass = from_table(wavelengths, index)
         except ValueError as error:
-            raise ValueError(f"`index`: {error}") from error
+            raise ValueError(f"{option('index')}: {error}") from error
     made_of = {"glass": glass, "pitch": pitch, "span": span, "catalog": catalog}
     wrap = {"design_wavelength": design_wavelength, "levels": levels or 0}
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
@@ -354,7 +356,7 @@ def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: 
     """
     D, W = len(scene.depths), len(scene.wavelengths)
     whole = chosen.memory < min(_CHUNK, allowed_bytes())
-    helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
+    helps = f"take fewer by {option('samples')} or a larger {option('tol')}, a smaller window by {option('size')}"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
