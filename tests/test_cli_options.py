@@ -73,9 +73,9 @@ def test_an_option_means_the_same_everywhere():
     forms = defaultdict(lambda: defaultdict(list))
     for name, parser in PARSERS.items():
         for action in parser._actions:
-            for option in action.option_strings:
-                if option.startswith("--"):
-                    forms[option][action.type, action.metavar, action.nargs].append(name)
+            for flag in action.option_strings:
+                if flag.startswith("--"):
+                    forms[flag][action.type, action.metavar, action.nargs].append(name)
     different = {option: dict(found) for option, found in forms.items() if len(found) > 1}
     assert set(different) == set(DIFFERENT)
 
@@ -429,6 +429,13 @@ print(*sorted(name for name in sys.modules if name.startswith("raytrace.") and n
 @pytest.mark.parametrize("command", [*COMMANDS, *WAVE_COMMANDS], ids=lambda command: command.name)
 def test_every_option_has_a_help_text(command):
     assert all(action.help for action in rows(command).values())
+
+
+def test_the_viewer_opens_a_lens_at_an_object_distance(command, monkeypatch):
+    lenses = []
+    monkeypatch.setattr("raytrace.viewer.server.serve", lambda lens, **options: lenses.append(lens))
+    assert command("view", "double_gauss", "--object-distance", 500) == (0, "", "")
+    assert float(lenses[0].surfaces[0].thickness) == 500
 
 
 def test_options_of_other_commands_are_not_built():

@@ -42,7 +42,7 @@ Returned = TypeVar("Returned")
 Name = TypeVar("Name", bound=str)
 #: Carries out a command; None where it has printed or saved its result.
 Run: TypeAlias = Callable[[argparse.Namespace], Result | None]
-_FIGURE = "plot_"  # prefix of options of the figure: --log, dest="plot_log"
+_FIGURE = "plot_"  # prefix of the names of options of the figure, as plot_log
 #: Outputs that may be an input: a checkpoint replaces the one that is resumed.
 _REPLACES = {("checkpoint", "resume")}
 
@@ -144,7 +144,7 @@ def options_of(arguments: argparse.Namespace) -> dict:
 def result_of_lens(arguments: argparse.Namespace, verb: Callable[..., Returned]) -> Returned:
     """Call a public function with the lens and the options. Its errors begin with the name of the lens.
 
-    Options that a function of a merit function has no parameters for define the merit function.
+    If the function takes a merit function, options that are not its parameters define the merit function.
     """
     lens, options = open_lens(arguments), options_of(arguments)
     try:
@@ -162,7 +162,7 @@ def result_of_lens(arguments: argparse.Namespace, verb: Callable[..., Returned])
 
 
 def _as_built(options: dict) -> dict:
-    """The keyword `as_built`, of the options of --as-built, which are taken out; none without it."""
+    """The keyword `as_built`, made of --as-built and its options, which are removed; empty without --as-built."""
     settings = {name: options.pop(name) for name in ("grade", "limits", "weight") if name in options}
     if not options.pop("as_built", False):
         if settings:

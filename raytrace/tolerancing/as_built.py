@@ -74,7 +74,7 @@ class AsBuilt:
 
     def words(self) -> str:
         """The settings in words."""
-        by = self.grade or "of " + ("`limits`" if self.limits else "`tolerances`" if self.tolerances else "its file")
+        by = self.grade or "of " + ("limits" if self.limits else "tolerances" if self.tolerances else "its file")
         return f"{by}, weight {self.weight:g}"
 
     def of(self, lens: Lens) -> "AsBuiltTerm":
