@@ -53,7 +53,8 @@ def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, cente
         """Of each lens alone: a camera's kernel does not depend on the others of its call."""
         each = zip(errors.reshape(len(distances), -1).split(1), distances.split(1), strict=True)
         lenses = [(rt.perturbed(built.variables(), built.tolerances, error), distance) for error, distance in each]
-        return torch.cat([rt.psf(one, parameters, object_distances=z, **conditions).kernel[:, 0] for one, z in lenses])
+        kernels = [rt.psf(one, parameters, object_distances=z, **conditions).kernel for one, z in lenses]
+        return torch.cat(kernels).flip(-1)  # columns of pictures grow towards -x
 
     with torch.no_grad():
         kernels = built.kernels(distances, 1, errors)
@@ -237,9 +238,9 @@ def test_wrong_cameras_as_built_are_refused(lens):
         ({"tolerances": absent}, rt.BadTolerance, "thickness of surface 40: this lens has surfaces 0 to 11"),
         ({"tolerances": tolerances, "model": "paraxial"}, ValueError, "'paraxial' traces no rays of a lens as built"),
         (
-            {"center": "centroid", "pupil_points": torch.zeros(2, 3)},
+            {"center": "centroid", "model": rt.Gaussian(rays=torch.zeros(2, 3))},
             ValueError,
-            "pupil_points are about the chief ray",
+            "pupil points are about the chief ray",
         ),
     ):
         with pytest.raises(error, match=words):
@@ -250,7 +251,7 @@ def test_wrong_cameras_as_built_are_refused(lens):
     built = rt.Camera(variables, rt.RedNet(), tolerances=tolerances)
     with pytest.raises(rt.BadTolerance, match=r"expected \(79,\), an error for each row"):
         built.kernels(DISTANCES, 0, errors[:, :5])
-    with pytest.raises(ValueError, match="2 object_distances for a batch of 3 lenses"):
+    with pytest.raises(ValueError, match="errors of 3 lenses at 2 object distances"):
         built.kernels(DISTANCES[:2], 0, errors)
     with pytest.raises(ValueError, match="refocus 'gap': expected sensor or none"):
         camera(lens, dataclasses.replace(BUILT, refocus="gap"))

@@ -261,7 +261,7 @@ def test_states_are_of_their_element():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sensor": None}, "give sensor=rt.Sensor"),
+        ({"center": "centroid"}, "windows of a phase element are about the chief ray"),
         ({"model": "gaussian"}, "model 'gaussian' with phase elements"),
         ({"sensor_distance": 35.5}, "leave sensor_distance out"),
         ({"wavelengths": (0.5,)}, "lens.at"),

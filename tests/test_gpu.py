@@ -176,7 +176,7 @@ def test_training_step(model):
         torch.manual_seed(0)
         lens = rt.to(rt.read_lens("double_gauss"), device=device)
         network = nn.Conv2d(1, 1, 5, padding=2).double()
-        camera = rt.Camera(rt.Variables(lens, "curvature sensor"), network, model=model, noise=0.0).to(device)
+        camera = rt.Camera(rt.Variables(lens, "curvature sensor"), network, model=model).to(device)
         images = torch.stack([torch.as_tensor(picture) for picture in dead_leaves(2, size=64, seed=1).samples])
         images = (images.double() / 255).to(device)
         distances = torch.tensor([20e3, 30e3], dtype=torch.float64, device=device)

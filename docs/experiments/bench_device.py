@@ -28,7 +28,7 @@ def psf_step(model, lens, rays=None, size=65):
 def training_step(device, dtype=torch.float32):
     torch.manual_seed(0)
     lens = rt.to(rt.read_lens("double_gauss"), device=device)
-    camera = rt.Camera(rt.Variables(lens, "curvature sensor"), rt.RedNet(), model="gaussian", noise=0.0).to(device)
+    camera = rt.Camera(rt.Variables(lens, "curvature sensor"), rt.RedNet(), model="gaussian").to(device)
     images = torch.rand(8, 256, 256, dtype=dtype, generator=torch.Generator().manual_seed(1)).to(device)
     distances = torch.linspace(20e3, 40e3, 8, dtype=torch.float64, device=device)
 

@@ -21,7 +21,7 @@ from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import even_distances, patch_spectrum
 from raytrace.imaging.codesign import TEST_EPOCH, batch, camera
-from raytrace.imaging.image import blur, transfer_functions
+from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, files, read, split
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, restore
 from raytrace.imaging.training import read_json
@@ -41,8 +41,8 @@ def kernels_of(built: Camera, errors: Tensor | None) -> Tensor:
     """PSFs (K, h, w) of all lenses (L, N), or of the nominal one, at even object distances."""
     distances = even_distances(built, _DISTANCES)
     if errors is None:
-        return built.kernels(distances)
-    return built.kernels(distances.repeat(len(errors)), 0, errors.repeat_interleave(len(distances), 0))
+        return built.kernels(distances)[:, 0]
+    return built.kernels(distances.repeat(len(errors)), 0, errors.repeat_interleave(len(distances), 0))[:, 0]
 
 
 def trained(built: Camera, spectrum: Tensor, errors: Tensor | None) -> tuple[float, Tensor]:
@@ -67,7 +67,8 @@ def tested(built: Camera, pictures: Pictures, seed: int, sensor: float, filter: 
     settings = dataclasses.replace(SETTINGS, seed=seed, crops=-(-count // len(pictures)))
     samples = batch(pictures, settings, list(range(count)), TEST_EPOCH)
     each = None if errors is None else errors.repeat_interleave(_PATCHES, 0)
-    image = blur(samples.picture.double(), built.kernels(samples.distance, 0, each)) + SETTINGS.noise * samples.noise
+    image = built.image(samples.picture.double(), samples.distance, 0, each)
+    image = built.recorded(image, index=samples.index, seed=samples.seed)
     border = SETTINGS.size // 2
     inner = (..., slice(border, -border), slice(border, -border))
     difference = (restore(image, filter) - built.target(samples.picture.double()))[inner].reshape(_LENSES, -1)

@@ -215,9 +215,11 @@ def examples(
     patches = batch(pictures, settings, list(range(min(_PATCHES, len(pictures) * settings.crops))), TEST_EPOCH)
     chosen = int(patches.picture.flatten(1).std(1).argmax())
     distances = torch.tensor(distances, dtype=camera.fields.dtype)
-    picture = patches.picture[chosen].expand(len(distances), -1, -1)
-    image = camera.image(picture, distances) + camera.noise * patches.noise[chosen]
-    return {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}
+    picture = patches.picture[chosen].expand(len(distances), -1, -1, -1)
+    index = patches.index[[chosen] * len(distances)]
+    image = camera.recorded(camera.image(picture, distances), index=index, seed=patches.seed)
+    shown = {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}
+    return {name: images[:, 0] for name, images in shown.items()}
 
 
 def closed_forms(lens: Lens, settings: CodesignSettings, spectrum: Tensor, rows: Sequence[str]) -> list[Optimum]:

@@ -3,7 +3,7 @@
 import argparse
 
 from raytrace.cli.options import OPTIONS, catalog, json, output_folder, plot, substitute
-from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
+from raytrace.cli.settings import SEED, add_options, defaults_of, listed, option, picture_options, settings_options
 from raytrace.cli.types import (
     count,
     extent,
@@ -37,7 +37,8 @@ EXAMPLES = """examples:
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign cooke_triplet --sensor 24x16 --vary thickness curvature --hold efl buildable --preset unet -o colour
   raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
-  raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal"""
+  raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal
+  raytrace codesign cooke_triplet --settings run/settings.json --set rate_optics=5e-4 decay=cosine -o again"""
 
 #: The options by the field of `CodesignSettings`.
 ROWS = {
@@ -177,12 +178,15 @@ ROWS = {
     "patch": option("pixels across a restored patch"),
     "crops": option("patches of a picture in an epoch"),
 }
-_PICTURES = ("patch", "crops")
-_TRAINING = ("depth", "width", "epochs", "batch", "rate_network", "rate_optics", "decay", "precision")
 _OF_ONE_RUN = ("model", "seed")
-_AS_BUILT = ("as_built", "grade", "limits", "refocus", "cameras")
-_SENSOR = ("sensor", "response", "mosaic", "full_well", "read_noise", "bits")
-_SCENE = tuple(name for name in ROWS if name not in (*_OF_ONE_RUN, *_PICTURES, *_TRAINING, *_AS_BUILT, *_SENSOR))
+#: Options that the help page shows; settings of a file, or of --set, are all of them.
+_SHOWN = (
+    *("vary", "bounds", "hold", "start", "f_number", "wavelengths", "near", "far", "fields", "sensor", "as_built"),
+    *("grade", "epochs", "batch", "noise"),
+)
+
+
+EXAMPLES += "\n\n" + listed(CodesignSettings, ROWS)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -212,31 +216,23 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", metavar="NAME", default="cpu", help="of the training, cpu or cuda (default cpu)")
     parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")
     defaults = defaults_of(CodesignSettings)
-    group = picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
-    add_options(group, defaults, ROWS, *_PICTURES)
-    scene = parser.add_argument_group("lens and scene")
-    add_options(scene, defaults, ROWS, *_SCENE)
-    scene.add_argument(
+    settings_options(parser.add_argument_group("settings"), CodesignSettings)
+    picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
+    experiment = parser.add_argument_group(
+        "experiment",
+        "With --sensor the camera is that of a product: colour, the whole field, its noise, and the\n"
+        "wavelengths of the file unless --wavelength names others. Errors of manufacture are drawn by\n"
+        "the number of the sample.",
+    )
+    add_options(experiment, defaults, ROWS, *_SHOWN)
+    experiment.add_argument(
         "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
     )
-    sensor = parser.add_argument_group(
-        "sensor",
-        "With --sensor the camera is that of a product: colour, the whole field, its noise. The pixels are those of\n"
-        "--pixel; the wavelengths are those of the file unless --wavelength names others.",
-    )
-    add_options(sensor, defaults, ROWS, *_SENSOR)
-    built = parser.add_argument_group(
-        "lens as built",
-        "Errors of manufacture are drawn by the number of the sample: a run resumes\n"
-        "bit-identically, and processes share its batches. The result lists L1 and PSNR of\n"
-        "perturbed cameras that no training sees.",
-    )
-    add_options(built, defaults, ROWS, *_AS_BUILT)
-    training = parser.add_argument_group("network and training")
-    training.add_argument(
+    experiment.add_argument(
         "--preset",
         choices=("cpu", "paper", "unet"),
         default="cpu",
         help="RED-Net of 10 layers of 32 maps (cpu, default), of 30 layers of 64 maps (paper), or a small U-Net (unet)",
     )
-    add_options(training, defaults, ROWS, *_TRAINING)
+    others = [name for name in ROWS if name not in (*_SHOWN, *_OF_ONE_RUN)]
+    add_options(parser, defaults, ROWS, *others, hidden=True)

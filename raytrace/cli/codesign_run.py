@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor, distributed
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
+from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
 from raytrace.imaging.codesign import (
     LENS,
@@ -98,7 +99,7 @@ def open_experiment(
     FORMATS[".zmx"].write(initial, str(path), catalogs=catalogs(arguments))  # refuses what the file cannot hold
     least = settings.patch + settings.size - 1
     sensor = sensor_at_start(settings)
-    colour = sensor is not None and len(sensor.channels) == 3
+    colour = len(sensor.channels) == 3
     leaves = arguments.limit or _LEAVES, max(256, least), colour
     kind, parts = "", (Pictures((), ()),) * 2
     if pictures is None:
@@ -129,11 +130,14 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
     without training of a network."""
     preset = PRESETS[arguments.preset]
     is_unet = isinstance(preset, UNetShape)
-    options = {name: value for name, value in vars(arguments).items() if value is not None}
+    options = {name: value for name, value in vars(arguments).items() if value is not None and value is not False}
     shape = {"depth": preset.levels if is_unet else preset.depth, "width": preset.width}
-    options = {"network": "u-net" if is_unet else "red-net"} | shape | options | _wavelengths(arguments)
-    options |= {name: " ".join(options[name]) for name in ("vary", "bounds", "hold", "limits") if name in options}
-    if "fields" in options:
+    given = given_settings(arguments, CodesignSettings)
+    network = {"network": "u-net" if is_unet else "red-net"} | shape
+    options = network | _wavelengths(arguments, given) | given | options
+    texts = ("vary", "bounds", "hold", "limits")
+    options |= {name: " ".join(options[name]) for name in texts if isinstance(options.get(name), list)}
+    if arguments.fields:
         if any(x for x, _ in options["fields"]):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
         options["fields"] = [y for _, y in options["fields"]]
@@ -153,10 +157,12 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
     return CodesignSettings.of(options)
 
 
-def _wavelengths(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
-    """Wavelengths and weights of the options, or those of the file, its primary one first."""
+def _wavelengths(arguments: argparse.Namespace, given: Mapping) -> dict[str, Sequence[float]]:
+    """Wavelengths and weights of the options or of given settings, or those of the file, its primary one first."""
     wavelengths, weights = arguments.wavelengths, arguments.wavelength_weights
-    of_file = arguments.file_wavelengths or (arguments.sensor and not wavelengths)
+    if "wavelengths" in given and not wavelengths and not arguments.file_wavelengths:
+        return {}
+    of_file = arguments.file_wavelengths or ((arguments.sensor or given.get("sensor")) and not wavelengths)
     if not of_file:
         wavelengths = wavelengths or CodesignSettings.wavelengths
         return {"wavelengths": wavelengths, "wavelength_weights": weights or [1.0] * len(wavelengths)}
@@ -183,7 +189,7 @@ def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int =
     """
     trained = network_at_start(settings).to(memory_format=torch.channels_last)
     sensor = sensor_at_start(settings)
-    picture = torch.rand(count, 1 if sensor is None else len(sensor.channels), size, size)
+    picture = torch.rand(count, len(sensor.channels), size, size)
     seconds = {}
     for name, enabled in (("float32", False), ("bfloat16", True)):
         for _ in range(2):  # the first call prepares

@@ -5,10 +5,17 @@ A command passes its rows, {field: option(...)}, with the dataclass of settings:
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
+import json
+import textwrap
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from raytrace.cli.options import with_default
 from raytrace.cli.types import count, file_name, folder_name, positive_finite, seed_number
+from raytrace.words import RaytraceError, did_you_mean
 
 
 def option(
@@ -34,8 +41,11 @@ _KINDS: dict[type, dict] = {
 SEED = option("of random numbers", type=seed_number)
 
 
-def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: str) -> None:
-    """Add the options of these fields, of all rows if none are given. The parser stores None for a missing option."""
+def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: str, hidden: bool = False) -> None:
+    """Add the options of these fields, of all rows if none are given. The parser stores None for a missing option.
+
+    hidden: without a help text, for settings that a file gives.
+    """
     for name in names or rows:
         row, default = dict(rows[name]), defaults[name]
         flag = f"--{_spelled(name, row)}"
@@ -43,7 +53,104 @@ def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: s
         settings = _KINDS.get(type(default), {}) | row
         if "action" not in settings:
             settings["help"] = with_default(row["help"], default)
+        if hidden:
+            settings["help"] = argparse.SUPPRESS
         group.add_argument(flag, dest=name, **{key: value for key, value in settings.items() if value is not None})
+
+
+# -- settings from a file ----------------------------------------------------------------------------------------------
+
+#: Entries of a run's settings.json that are no settings: what else decides its result.
+_OF_RUNS = ("lens", "pictures", "part", "world")
+
+
+class BadSettings(RaytraceError, ValueError):
+    """A file of settings that cannot be read, or an entry that is no setting."""
+
+
+def settings_options(group, kind: type) -> None:
+    """--settings and --set."""
+    group.add_argument(
+        "--settings",
+        metavar="FILE",
+        type=file_name,
+        help="settings of a TOML file, or of the settings.json of a run; other options override them",
+    )
+    example = next(field.name for field in dataclasses.fields(kind) if isinstance(field.default, float))
+    group.add_argument(
+        "--set",
+        metavar="NAME=VALUE",
+        nargs="+",
+        default=[],
+        help=f"single settings, {example}={defaults_of(kind)[example]:g}: every name of the list below",
+    )
+
+
+def listed(kind: type, rows: Mapping[str, Mapping]) -> str:
+    """The settings with their defaults and texts, for the end of a help page."""
+    lines = []
+    for name, default in defaults_of(kind).items():
+        about = rows[name]["help"].replace("%%", "%") if name in rows else ""
+        text = f"{name} = {_text(default, ' ') or '-'}" + (f": {about}" if about else "")
+        lines.append(textwrap.fill(text, 100, initial_indent="  ", subsequent_indent="      "))
+    return "\n".join(["settings, of --settings and --set:", *lines])
+
+
+def given_settings(arguments: argparse.Namespace, kind: type) -> dict:
+    """The settings of --settings and --set, by their names. Raises BadSettings."""
+    given = {} if arguments.settings is None else _of_file(arguments.settings, kind)
+    for words in arguments.set:
+        name, is_given, text = words.partition("=")
+        if not is_given:
+            raise BadSettings(f"--set {words}: expected NAME=VALUE")
+        try:
+            entry = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            entry = text
+        given[name] = _checked(kind, name, entry, "--set")
+    return given
+
+
+def _of_file(path: str, kind: type) -> dict:
+    """Settings of a TOML file, whose tables only group them, or of a run's settings.json."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        document = json.loads(text) if Path(path).suffix.lower() == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise BadSettings(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise BadSettings(f"{path}: no TOML, and no JSON of a run ({error})") from error
+    if not isinstance(document, dict):
+        raise BadSettings(f"{path}: expected settings by their names")
+    entries: dict = {}
+    for name, entry in document.items():
+        entries |= entry if isinstance(entry, dict) else {name: entry}
+    known = defaults_of(kind)
+    return {
+        name: _checked(kind, name, entry, path)
+        for name, entry in entries.items()
+        if name in known or (name not in _OF_RUNS and not isinstance(document.get("world"), dict))
+    }
+
+
+def _checked(kind: type, name: str, entry: object, where: str) -> object:
+    """A setting in the type of its field; whole numbers are numbers, lists of numbers tuples. Raises BadSettings."""
+    hints = typing.get_type_hints(kind)
+    if name not in hints:
+        raise BadSettings(f"{where}: {name!r} is no setting{did_you_mean(name, hints)}")
+    hint = hints[name]
+    kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for wanted in kinds:
+        origin = typing.get_origin(wanted) or wanted
+        if origin is tuple and isinstance(entry, Sequence) and not isinstance(entry, str):
+            if all(isinstance(number, int | float) for number in entry):
+                return tuple(map(float, entry))
+        elif origin is float and isinstance(entry, int) and not isinstance(entry, bool):
+            return float(entry)
+        elif isinstance(entry, origin) and not (origin is int and isinstance(entry, bool)):
+            return entry
+    expected = " or ".join(getattr(wanted, "__name__", str(wanted)) for wanted in kinds)
+    raise BadSettings(f"{where}: {name} = {entry!r}: expected {expected}")
 
 
 def words(settings, rows: Mapping[str, Mapping]) -> list[str]:

@@ -3,7 +3,7 @@
 import argparse
 
 from raytrace.cli.options import Option, group, json, output_folder, plot
-from raytrace.cli.settings import SEED, add_options, defaults_of, option, picture_options
+from raytrace.cli.settings import SEED, add_options, defaults_of, listed, option, picture_options, settings_options
 from raytrace.cli.types import positive, positive_finite
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.settings import DesignSettings
@@ -25,7 +25,8 @@ EXAMPLES = """examples:
   raytrace wave design --element smooth --starts 8 -o smooth --json
   raytrace wave design --element rings --levels 16 --tolerance 20 -o etched
   raytrace wave design --element zernike --loss images --filter towards --optimizer adadelta --rate 1 -o images
-  raytrace wave design --data pictures --steps 300 -o run"""
+  raytrace wave design --data pictures --steps 300 -o run
+  raytrace wave design --settings run/settings.json --set rate=0.01 -o again"""
 
 NANOMETRE = 1e-6  # mm
 PICTURES = "folder of pictures of 256 × 256 pixels or more; four fifths make the filters, the others are restored"
@@ -66,7 +67,11 @@ ROWS = {
 }
 
 
+EXAMPLES += "\n\n" + listed(DesignSettings, ROWS)
+
+
 def options(parser: argparse.ArgumentParser) -> None:
+    settings_options(parser, DesignSettings)
     defaults = defaults_of(DesignSettings)
     add_options(parser, defaults, ROWS, "kind", "glass", "terms", "levels", "tolerance")
     for add in (camera(), light(depths=_DEPTHS), pixels(size=255)):

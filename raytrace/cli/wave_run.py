@@ -11,6 +11,7 @@ from torch import Tensor
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, say
+from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
 from raytrace.imaging.image import blur
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
@@ -114,17 +115,19 @@ def design(arguments: argparse.Namespace) -> DesignedElement:
 
 
 def _design_settings(arguments: argparse.Namespace) -> DesignSettings:
-    kind = arguments.kind or DesignSettings.kind
+    given = given_settings(arguments, DesignSettings)
+    options = {name: value for name, value in vars(arguments).items() if name not in ("noise", "size")}
+    options = given | {name: value for name, value in options.items() if value is not None}
+    kind = options.get("kind", DesignSettings.kind)
     if kind != "rings":
-        for option, value in (("feature", arguments.feature), ("tolerance", 1e6 * (arguments.tolerance or 0))):
+        for option, value in (("feature", arguments.feature), ("tolerance", 1e6 * options.get("tolerance", 0))):
             if value:
                 raise CommandError(f"--{option} {value:g}: a {kind} element has no rings; take --element rings")
-    options = {name: value for name, value in vars(arguments).items() if name not in ("noise", "size")}
     defaults = {"glass": "F_SILICA" if kind == "rings" else "PMMA", "terms": 36 if kind == "zernike" else 7}
     more = {name: options.get(name) or value for name, value in defaults.items()}
     more |= {"pitch": arguments.feature} if arguments.feature else {}
     more |= {"noise": (arguments.noise, arguments.noise)} if arguments.noise else {}
-    more |= {"restoration": "blind"} if arguments.loss != "images" else {}
+    more |= {"restoration": "blind"} if options.get("loss") != "images" else {}
     return DesignSettings.of(options, **more)
 
 

@@ -17,8 +17,13 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer.step()
     camera.variables.project()                               # onto the bounds, if there are any
 
-Without a sensor the pictures are grey, (B, H, W), at one of the `fields`, with white noise. A phase element at the
-stop, whose heights are learned with the lens, or an element without a lens:
+Grey pictures, (B, H, W), of field points by their numbers, as in studies of a few points of a scene:
+
+    grey = rt.Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1)
+    camera = rt.Camera(rt.Variables(lens, "sensor"), rt.RedNet(), sensor=grey, fields=[0, 14])
+    restored = camera(torch.rand(2, 64, 64), [25e3, 30e3], field=[0, 1])              # (B, 1, 44, 44)
+
+A phase element at the stop, whose heights are learned with the lens, or an element without a lens:
 
     camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.PhaseVariables(element), sensor=sensor)
     camera = rt.Camera(rt.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
@@ -34,58 +39,57 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
-from raytrace.imaging.field_kernels import check_model, order_of
-from raytrace.imaging.image import add_noise, as_picture, blur
-from raytrace.imaging.render import Rendering, element_in_stop, linearised, patch_kernels, render
+from raytrace.imaging.field_kernels import (
+    by_angle,
+    check_model,
+    field_kernels,
+    has_points,
+    order_of,
+    warn_of_dark_places,
+)
+from raytrace.imaging.image import as_picture, blur
+from raytrace.imaging.render import Rendering, check_points, element_in_stop, illumination_at, linearised, render
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
-from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import plain
-from raytrace.maths.sampling import Grid, grid
-from raytrace.psf_models import MODELS, Execution, NotConverged, Paraxial, drt, model_of, psf
-from raytrace.psf_models.gaussian import gaussian_pixels
-from raytrace.psf_models.models import is_sampled_in_common
-from raytrace.psf_models.result import moments_of_rays
+from raytrace.psf_models import DRT, MODELS, Fourier, Gaussian, NotConverged, Paraxial, Wave, model_of, name_of
 from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.tolerances import Tolerances
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
-from raytrace.tracing.scene import Memo, beam_share, chief_landing, scene, symmetry, trace_scene
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
 from raytrace.words import named_value
 
-_RAY_WIDTH = 0.25  # half width in pixels of a ray of pupil_points with "drt", for a derivative
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
 class Camera(nn.Module):
-    """Simulated capture and restoration of images in [0, 1], each at its own object distance.
+    """Simulated capture and restoration of images in [0, 1], each at its own object distance and place.
 
-    With a sensor the images are (B, C, H, W), linear in light, of the C channels of its response, each at its place on
-    the sensor; without one they are grey, (B, H, W), at one of the `fields`.
+    Images are (B, C, H, W), linear in light, of the C channels of the sensor's response; of one channel also (B, H, W),
+    or (H, W) for all object distances.
 
     variables: of the lens, or of a phase element without a lens, `sensor_distance` mm before the sensor, at wavelengths
-    (W,) µm as for `render`; element: variables of one at the stop of the lens. Elements need a sensor.
-    network: (B, C, h, w) -> the same, C = 1 without a sensor; model: a PSF model, by default "gaussian", with elements
-    "wave".
-    sensor: its response, noise, quantisation and mosaic are those of the images; whole pictures: see `render`.
-    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
-    on the axis by default; with a sensor they are those of its centre, of 0.7 and of 1 of its half diagonal.
-    pixels: the PSF window, a Grid, 21 × 21 of 5 µm by default, or its number of pixels of the sensor, 21 by default.
-    normalise: "window" or "energy", as for `psf`; illumination: images of a sensor have the relative illumination of
-    their places.
-    noise: standard deviation of the sensor noise. tol: allowed error of the kernels: the order of the PSF model is
-    chosen once, for the lens at the first call (`plan`). rho: of the paraxial model.
-    network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
-    pupil_points: (2, P), PSFs of these rays, all of one weight, instead of as many rays as `tol` needs ("gaussian",
-    "drt"): a Gaussian of twelve rays has their centroid and covariance, not those of all light.
+    (W,) µm as for `render`; element: variables of one at the stop of the lens.
+    network: (B, C, h, w) -> the same; sensor: its response, noise, quantisation and mosaic are those of the images; by
+    default `rt.Sensor()`, grey and without noise. Whole pictures: see `render`.
+    model: a PSF model or its name, by default "gaussian", with elements "wave". Gaussian(rays=points) and
+    DRT(rays=points) take the rays of these pupil points, instead of as many as `tol` needs.
+    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field:
+    places of images, which move with the image of the field point. By default those of the centre of the sensor, of 0.7
+    and of 1 of its half diagonal, which stay where they are on it; without a sensor the axis.
+    pixels: of the sensor across the PSF window, an odd number, 21 by default.
     center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): image position is no
-    error. tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens
-    for each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
+    error. normalise: "window" (PSFs of sum 1) or "energy" (of the share of the light through the entrance pupil);
+    illumination: images have the relative illumination of their places, too.
+    tol: allowed error of the kernels: the order of the PSF model is chosen once, for the lens at the first call
+    (`plan`). network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
+    tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens for
+    each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
-    pupil_points, center, tolerances, normalise and noise are those of cameras without a sensor.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
     its variables and the sensor, and loads into a camera of the same ones alone.
     Warns UnfilledStop once, for the lens at construction.
@@ -96,23 +100,20 @@ class Camera(nn.Module):
         variables: Variables | PhaseVariables,
         network: nn.Module,
         *,
+        sensor: Sensor | None = None,
         element: PhaseVariables | None = None,
         sensor_distance: float | None = None,
         wavelengths: Sequence[float] | None = None,
-        model: str | None = None,
+        model: str | Paraxial | Fourier | Gaussian | DRT | Wave | None = None,
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
-        pixels: Grid | int | None = None,
-        normalise: str = "window",
-        noise: float = 0.1,
-        tol: float = 1e-2,
-        rho: float = 0.5,
-        network_dtype: torch.dtype | None = None,
-        pupil_points: Tensor | None = None,
+        pixels: int = 21,
         center: Literal["chief", "centroid"] = "chief",
-        tolerances: Tolerances | None = None,
-        sensor: Sensor | None = None,
+        normalise: Literal["window", "energy"] = "window",
         illumination: bool = False,
+        tol: float = 1e-2,
+        network_dtype: torch.dtype | None = None,
+        tolerances: Tolerances | None = None,
     ):
         super().__init__()
         if not isinstance(variables, Variables | PhaseVariables):
@@ -120,29 +121,30 @@ class Camera(nn.Module):
             expected = "the Variables of a lens: Variables(lens, …), or of an element: PhaseVariables(element)"
             raise TypeError(f"Camera: `variables` is {kind}; expected {expected}")
         self.variables, self.element, self.network = variables, element, network
-        self.range, self.sensor, self.illumination = object_distances, sensor, illumination
+        self.range, self.sensor, self.illumination = object_distances, sensor or Sensor(), illumination
         self.sensor_distance, self.wavelengths = sensor_distance, wavelengths
         self._check_element()
-        self.model = model or ("wave" if self.elements() else "gaussian")
         with torch.no_grad():
             lens = self.lens()
-        like = lens.wavelengths
-        if fields is not None:
-            self.fields = field_points(fields, like=lens)
-        else:
-            self.fields = like.new_zeros(2, 1) if sensor is None else self._fields_of_sensor()
-        self._places = None if sensor is None else sensor.landing(lens, self.fields).detach()
+        if fields is None and sensor is None:
+            fields = [0]
+        #: Field points (2, F) of the places that `field` numbers, and their points (2, F) mm where these stay.
+        self.fields = self._fields_of_sensor() if fields is None else field_points(fields, like=lens)
+        self.points = self.sensor.landing(lens, self.fields).detach() if fields is None else None
         warn_of_filling(lens, self.fields)
-        pitch = like.new_tensor(0.005 if sensor is None else sensor.pitch)
-        self.pixels = pixels if isinstance(pixels, Grid) else grid(pitch, pixels or 21)
-        self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
-        self.pupil_points, self._order = pupil_points, None
-        self.center, self.tolerances = center, tolerances
-        self._check()
+        self.size, self.center, self.normalise, self.tol, self.network_dtype = (
+            pixels,
+            center,
+            normalise,
+            tol,
+            network_dtype,
+        )
+        self.tolerances = tolerances
+        self.use(model or ("wave" if self.elements() else "gaussian"))
         self._memo = Memo(object_distances=object_distances)
 
     def _check_element(self) -> None:
-        """Refuse elements without a sensor, and numbers of the other kind of camera. Raises ValueError, TypeError."""
+        """Refuse numbers of the other kind of camera. Raises ValueError, TypeError."""
         is_alone = isinstance(self.variables, PhaseVariables)
         if self.element is not None and not isinstance(self.element, PhaseVariables):
             raise TypeError(f"Camera: `element` is {named_value(self.element)}; expected PhaseVariables(element)")
@@ -153,8 +155,6 @@ class Camera(nn.Module):
             raise ValueError(f"a camera {'of an element without' if is_alone else 'with'} a lens: {needed}")
         if self.wavelengths is not None and not is_alone:
             raise ValueError("wavelengths of a camera with a lens: give lens.at(wavelengths=…)")
-        if self.sensor is None and (is_alone or self.element is not None):
-            raise ValueError("a camera with a phase element: give sensor=rt.Sensor(…), whose pixels its kernels have")
 
     def lens(self) -> Lens:
         """The current lens; of an element without one, the stop that it is in."""
@@ -170,15 +170,20 @@ class Camera(nn.Module):
     def _check(self) -> None:
         """Refuse what cannot be simulated. Raises ValueError, BadTolerance."""
         check_model(self.model, self.elements())
-        if self.center not in ("chief", "centroid"):
-            raise ValueError(f"center {self.center!r}: expected chief or centroid")
-        if self.center == "centroid" and self.pupil_points is not None:
-            raise ValueError("windows of the rays of pupil_points are about the chief ray: give center chief")
-        if self.sensor is not None and self.pupil_points is not None:
-            raise ValueError("pupil_points and a sensor: the kernels of a sensor have as many rays as tol needs")
-        if self.sensor is not None and (self.pixels.rows, self.pixels.columns) != (self.size, self.size):
-            shape = f"{self.pixels.columns} × {self.pixels.rows}"
-            raise ValueError(f"pixels {shape}: expected a square window of an odd number of pixels of the sensor")
+        for name, word, known in (
+            ("center", self.center, ("chief", "centroid")),
+            ("normalise", self.normalise, ("window", "energy")),
+        ):
+            if word not in known:
+                raise ValueError(f"{name} {word!r}: expected {' or '.join(known)}")
+        if isinstance(self.size, bool) or not isinstance(self.size, int) or self.size < 1 or self.size % 2 == 0:
+            raise ValueError(f"pixels {self.size!r}: expected an odd number of pixels of the sensor")
+        if self.center == "centroid" and has_points(self.parameters):
+            raise ValueError("windows of the rays of pupil points are about the chief ray: give center chief")
+        if self.elements() and (self.center, self.normalise) != ("chief", "window"):
+            raise ValueError(
+                "windows of a phase element are about the chief ray, of sum 1: leave center, normalise out"
+            )
         if self.tolerances is None:
             return
         if self.elements():
@@ -189,8 +194,7 @@ class Camera(nn.Module):
         sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        values = self.fields, self.pixels, self.pupil_points, self._places
-        self.fields, self.pixels, self.pupil_points, self._places = converted(values, fn)
+        self.fields, self.points, self.parameters = converted((self.fields, self.points, self.parameters), fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
 
@@ -199,11 +203,6 @@ class Camera(nn.Module):
         with torch.no_grad():
             fields = self.sensor.fields(self.lens(), self.sensor.on_diagonal(shares))
         return fields[:, ~fields.isnan().any(0)]
-
-    @property
-    def size(self) -> int:
-        """Pixels across the PSF window."""
-        return self.pixels.rows - (self.pixels.rows + 1) % 2
 
     def rates(self, *, optics: float, network: float, element: float | None = None) -> list[dict]:
         """Groups of parameters for an optimiser of torch, with rates of their own: of the variables and the network.
@@ -226,8 +225,8 @@ class Camera(nn.Module):
             **self.variables.identity(),
             "element": None if self.element is None else self.element.identity(),
             "sensor_distance": self.sensor_distance,
-            "sensor": None if self.sensor is None else plain(dataclasses.asdict(self.sensor)),
-            "window": [self.pixels.rows, self.pixels.columns, float(self.pixels.pitch)],
+            "sensor": plain(dataclasses.asdict(self.sensor)),
+            "window": [self.size, self.size, self.sensor.pitch],
             "model": self.model,
             "object_distances": list(self.range),
             "network": type(self.network).__name__,
@@ -254,11 +253,15 @@ class Camera(nn.Module):
     @property
     def margin(self) -> int:
         """Rows and columns by which the PSF window shrinks an image."""
-        return self.pixels.rows - 1
+        return self.size - 1
 
-    def use(self, model: str, pupil_points: Tensor | None = None) -> None:
-        """Simulate with another PSF model; pupil_points: as for the constructor."""
-        self.model, self.pupil_points, self._order = model, pupil_points, None
+    def use(self, model: str | Paraxial | Fourier | Gaussian | DRT | Wave) -> None:
+        """Simulate with another PSF model, by its name or with its numbers."""
+        if isinstance(model, str):
+            self.model, self.parameters = model, None if model not in MODELS else model_of(model)
+        else:
+            self.model, self.parameters = name_of(model), model
+        self._order = getattr(self.parameters, "order", None)
         self._check()
 
     def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
@@ -272,73 +275,88 @@ class Camera(nn.Module):
         """The order of the PSF model that meets the tolerance at the ends and the middle of the range."""
         near, far = self.range
         distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
-        errors = None if self.tolerances is None else draw_errors(self.tolerances, len(distances))
+        lens = self.lens()
+        if self.tolerances is not None:
+            lens = self.as_built(draw_errors(self.tolerances, len(distances)))
+        how = {"elements": self.elements(), "center": self.center, "parameters": self.parameters}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
-            if self.sensor is not None:
-                about = self.lens(), self.sensor, self.model, self._places, distances, self.size, self.tol
-                self._order = order_of(*about, elements=self.elements())
-                return self._order
-            each = self.fields.split(1, 1)  # alone, as in `order_of`
-            self._order = max(self._psf(distances, field, tol=self.tol, errors=errors).order for field in each)
+            about = lens, self.sensor, self.model, self.fields, distances, self.size, self.tol
+            self._order = order_of(*about, **how)
         return self._order
 
     def kernels(
         self,
         object_distances: Tensor | Sequence[float] | float,
-        field: int = 0,
+        field: int | Sequence[int] = 0,
         errors: Tensor | None = None,
         *,
         points: Tensor | None = None,
     ) -> Tensor:
-        """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, in a window about its `center`.
+        """PSFs (B, C, rows, columns) of object distances (B,) mm, of the channels of the sensor.
 
-        object_distances: a tensor, a sequence or one number.
-        errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, one for each distance: PSFs
-        (B, C, rows, columns) of its channels, of sum 1 or the relative illumination, 0 where no light arrives, with the
+        object_distances: a tensor, a sequence or one number. field: number of one of the camera's `fields`, or (B,)
+        numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N), of
+        the object points that the lens without errors images at these places. 0 where no light arrives, with the
         warning DarkPlaces. Raises ValueError for points that are not finite.
         """
-        if (points is None) != (self.sensor is None):
-            missing = "places of the images: give points=sensor.patch_points(…)" if self.sensor else "sensor: give none"
-            raise ValueError(f"the camera has no {missing}")
-        object_distances = self._distances(object_distances)
-        if self.sensor is not None:
+        distances, lens = self._distances(object_distances), self.lens()
+        count = len(distances)
+        if points is not None:
+            check_points(points, count)
+            points, lens = points.to(self.fields), by_angle(lens)
+        about = field_kernels(
+            lens,
+            self.sensor,
+            self.model,
+            self.plan() if self._order is None else self._order,
+            self.size,
+            distances,
+            self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances),
+            elements=self.elements(),
+            parameters=self.parameters,
+            center=self.center,
+            normalise=self.normalise,
+            memo=self._memo if points is None and errors is None else None,
+        )
+        if errors is None and points is not None:
+            kernels = about.paired(points)
+        else:
+            fields = self._fields(field, count) if points is None else self.sensor.fields(lens, points)
             if errors is not None:
-                raise ValueError("errors of manufacture at places of a sensor: expected a camera without a sensor")
-            return self._kernels_of_places(points.to(self.fields), object_distances)
-        if self.pupil_points is not None:
-            return self._kernels_of_points(object_distances, self.fields[:, [field]], errors)
-        order = self.plan() if self._order is None else self._order
-        parts = [(object_distances, errors)]
-        if is_sampled_in_common(self.variables.lens, self.model):
-            many = [errors] * len(object_distances) if errors is None or errors.dim() == 1 else errors.split(1)
-            parts = zip(object_distances.expand(len(many)).split(1), many, strict=True)
-        fields = self.fields[:, field : field + 1]
-        return torch.cat([self._psf(z, fields, order=order, errors=some).kernel[:, 0] for z, some in parts])
+                built = self.as_built(errors)
+                if built.count not in (None, count):
+                    raise ValueError(
+                        f"errors of {built.count} lenses at {count} object distances: expected one for each"
+                    )
+                about = dataclasses.replace(about, lens=by_angle(built) if points is not None else built)
+            arrives = ~fields.isnan().any(0)
+            kernels = about.of_pairs(fields.nan_to_num(0.0))
+            kernels = torch.where(arrives[:, None, None, None], kernels, 0.0)
+        if points is None and (self.illumination or bool((kernels.detach() == 0).all((1, 2, 3)).any())):
+            points = self.sensor.landing(lens, self._fields(field, count))
+        if points is not None:
+            warn_of_dark_places(kernels, points)
+        return (
+            kernels * illumination_at(lens, self.sensor, points)[:, None, None, None] if self.illumination else kernels
+        )
+
+    def _fields(self, field: int | Sequence[int], count: int) -> Tensor:
+        """Field points (2, B) of one of the camera's fields, or of one for each of B images."""
+        return self.fields[:, torch.as_tensor(field, device=self.fields.device).expand(count)]
 
     def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
-        """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at points (2, N) mm on the sensor.
-
-        points: by default those of `fields` of the initial lens. Of sum 1, or the relative illumination.
-        """
-        points, distances = self._places if points is None else points, self._distances(object_distances)
-        pairs = points.to(distances).repeat(1, len(distances)), distances.repeat_interleave(points.shape[1])
-        return self._kernels_of_places(*pairs).unflatten(0, (len(distances), -1))
-
-    def _kernels_of_places(self, points: Tensor, distances: Tensor) -> Tensor:
-        """PSFs (B, C, rows, columns) of pairs of points (2, B) and distances (B,) mm."""
-        return patch_kernels(
-            self.lens(),
-            points,
-            sensor=self.sensor,
-            size=self.size,
-            order=self.plan() if self._order is None else self._order,
-            model=self.model,
-            object_distances=distances,
-            illumination=self.illumination,
-            elements=self.elements(),
-        )
+        """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at the camera's fields, or at points (2, N) mm."""
+        distances = self._distances(object_distances)
+        points = self.points if points is None else points
+        count = self.fields.shape[1] if points is None else points.shape[1]
+        pairs = distances.repeat_interleave(count), [*range(count)] * len(distances)
+        if points is None:
+            kernels = self.kernels(*pairs)
+        else:
+            kernels = self.kernels(pairs[0], points=points.to(distances)[:, pairs[1]])
+        return kernels.unflatten(0, (len(distances), -1))
 
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
         """Object distances (B,) mm. Raises ValueError for none and for other shapes."""
@@ -348,96 +366,52 @@ class Camera(nn.Module):
             raise ValueError(f"object_distances of shape {shape}: expected (B,) mm, one for each of B images, B ≥ 1")
         return distances.reshape(-1)
 
-    def _lens(self, errors: Tensor | None) -> tuple[Lens, Memo | None]:
-        """The current lens with its stored rays, or as built, whose rays are of one call."""
-        return (self.variables(), self._memo) if errors is None else (self.as_built(errors), None)
-
-    def _psf(
-        self,
-        distances: Tensor,
-        fields: Tensor,
-        *,
-        tol: float | None = None,
-        order: int | None = None,
-        errors: Tensor | None = None,
-    ):
-        # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
-        # traced one by the distortion and by tilts.
-        traces = MODELS[self.model].traces
-        lens, memo = self._lens(errors)
-        return psf(
-            lens,
-            Paraxial(self.rho, order) if self.model == "paraxial" else model_of(self.model, order=order),
-            tol=tol,
-            fields=fields if traces else torch.zeros_like(fields),
-            object_distances=distances,
-            grid=self.pixels,
-            center=self.center if traces or self.center == "centroid" else "axis",
-            normalise=self.normalise,
-            execution=Execution(memo=memo),
-        )
-
-    def _kernels_of_points(self, distances: Tensor, fields: Tensor, errors: Tensor | None) -> Tensor:
-        """PSFs (B, rows, columns) of the rays through the pupil points alone."""
-        lens, memo = self._lens(errors)
-        light = scene(lens, fields, distances, lens.wavelengths, memo)
-        chief = chief_landing(dataclasses.replace(light, wavelengths=lens.primary[None]))
-        centre = self.pixels.centre[:, None, None, None] + chief.expand(2, *light.shape)
-        window = dataclasses.replace(self.pixels, centre=centre)
-        points = self.pupil_points.to(fields)
-        weights = torch.full_like(points[0], 1 / len(points[0]))
-        if self.model == "drt":
-            kernels = drt.kernels_of_points(light, window, points, weights, width=_RAY_WIDTH).kernel
-        else:
-            traced = trace_scene(light, points)
-            arrives = torch.where(traced.valid, weights, 0.0).expand(*light.shape, -1)
-            centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
-            mirrored = points * points.new_tensor([[-1.0], [1.0]])
-            distance = (mirrored[:, :, None] - points[:, None]).abs().amax(0).amin(1)
-            if symmetry(light) != "none" and bool((distance < 1e-12).all()):
-                covariance = covariance[[0, 2]]  # xy is 0 but for rounding, and costs a quadrature over every pixel
-            energy = arrives.sum(-1) * beam_share(light)
-            kernels = energy[..., None, None] * gaussian_pixels(window, centroid, covariance)
-        shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-        kernel = (kernels * shares[:, None, None]).sum(2)[:, 0]
-        return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
-
     def image(
         self,
         picture: Tensor,
         object_distances: Tensor,
-        field: int = 0,
+        field: int | Sequence[int] = 0,
         errors: Tensor | None = None,
         *,
         points: Tensor | None = None,
     ) -> Tensor:
-        """The noise-free sensor image, (B, H - margin, W - margin), or (B, C, …) with a sensor.
+        """The noise-free sensor image, (B, C, H - margin, W - margin).
 
-        picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
-        With a sensor (B, C, H, W), centred at points (2, B) mm on it; integers are levels of sRGB (`linearised`).
-        Pictures of half precision are blurred in float32, which the image has.
-        errors: of manufacture, (N,) of one lens or (B, N).
-        Raises ValueError for other shapes and other ranges, as 0 to 255.
+        picture: (B, C, H, W) in [0, 1], centred at the places that field, points and errors give, as for `kernels`;
+        integers of 8 or 16 bits are levels of sRGB (`linearised`). Pictures of half precision are blurred in float32,
+        which the image has. Raises ValueError for other shapes and other ranges, as 0 to 255.
         """
-        object_distances = self._distances(object_distances)
-        if self.sensor is None:
-            picture = _grey(picture, object_distances)
-        else:
-            picture = self._of_channels(picture, object_distances)
-        kernels = self.kernels(object_distances, field, errors, points=points)
+        distances = self._distances(object_distances)
+        picture = self._of_channels(picture, distances)
+        kernels = self.kernels(distances, field, errors, points=points)
         light = picture.to(torch.promote_types(picture.dtype, torch.float32))
         return blur(light, kernels.to(light.dtype))
 
-    def _of_channels(self, picture: Tensor, object_distances: Tensor) -> Tensor:
-        """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,)."""
-        light = linearised(picture)
-        expected = len(object_distances), len(self.sensor.channels)
-        if light.dim() != 4 or tuple(light.shape[:2]) != expected:
+    def _of_channels(self, picture: Tensor, distances: Tensor) -> Tensor:
+        """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,). Raises ValueError."""
+        light, channels = self._light(picture), self.sensor.channels
+        count = len(distances)
+        if (
+            light.dim() != 4
+            or light.shape[1] != len(channels)
+            or (light.shape[0] != count and 1 not in (len(light), count))
+        ):
             raise ValueError(
-                f"pictures of shape {tuple(light.shape)}: expected ({expected[0]}, {expected[1]}, H, W), one for each "
-                f"object distance, of the channels {', '.join(self.sensor.channels)} of the sensor"
+                f"pictures of shape {tuple(torch.as_tensor(picture).shape)} at {count} object distances: expected "
+                f"({count}, {len(channels)}, H, W), one for each, of the channels {', '.join(channels)} of the sensor"
             )
-        return _in_range(light)
+        if (most := float(light.detach().max())) > _LARGEST:
+            raise ValueError(
+                f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"
+            )
+        return light
+
+    def _light(self, picture: Tensor) -> Tensor:
+        """Light (B, C, H, W) of pictures; of one channel also of (B, H, W) and (H, W)."""
+        light = linearised(picture)
+        if len(self.sensor.channels) == 1 and light.dim() in (2, 3):
+            light = light[..., None, :, :]
+        return light[None] if light.dim() == 3 else light
 
     def render(self, scene: Tensor, depth: Tensor | None = None, **options) -> Rendering:
         """The picture that the current lens projects onto the whole sensor, by the camera's PSF model: see `rt.render`.
@@ -452,58 +426,52 @@ class Camera(nn.Module):
         return render(self.elements(), scene, depth=depth, **{**alone, **options})
 
     def restore(self, image: Tensor) -> Tensor:
-        """The network's estimate (B, h, w), or (B, C, h, w) with a sensor, from a noisy image."""
-        is_grey = self.sensor is None
+        """The network's estimate (B, C, h, w) from a noisy image."""
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
             image = as_picture(image, "image")
             like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
-            stack = (image[:, None] if is_grey else image).to(like, memory_format=torch.channels_last)
-            restored = self.network(stack).to(image.dtype)
-            return restored[:, 0] if is_grey else restored
+            return self.network(image.to(like, memory_format=torch.channels_last)).to(image.dtype)
 
     def forward(
         self,
         picture: Tensor,
         object_distances: Tensor,
         *,
-        field: int = 0,
-        noise: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        field: int | Sequence[int] = 0,
         errors: Tensor | None = None,
         points: Tensor | None = None,
         index: Tensor | Sequence[int] | None = None,
         seed: int = 0,
     ) -> Tensor:
-        """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise.
-
-        errors: of manufacture, (N,) of one lens or (B, N). points: (2, B) mm on the sensor, of the images' centres;
-        index, seed: of its noise, see `Sensor.capture`.
-        """
+        """Blur, record, restore: arguments as for `image`; index, seed: of the noise, as for `recorded`."""
         image = self.image(picture, object_distances, field, errors, points=points)
-        if self.sensor is not None:
-            return self.restore(self.recorded(image, points, index, seed))
-        if noise is None:
-            return self.restore(add_noise(image, self.noise, generator=generator))
-        return self.restore(image + self.noise * noise)
+        return self.restore(self.recorded(image, points, index, seed))
 
     def recorded(
-        self, image: Tensor, points: Tensor, index: Tensor | Sequence[int] | None = None, seed: int = 0
+        self,
+        image: Tensor,
+        points: Tensor | None = None,
+        index: Tensor | Sequence[int] | None = None,
+        seed: int = 0,
     ) -> Tensor:
         """The sensor's record (B, C, h, w) of noise-free images, interpolated where it has a mosaic.
 
-        points: (2, B) mm of their centres; index, seed: of the noise, see `Sensor.capture`.
+        points: (2, B) mm of their centres, by default the middle of the sensor; index, seed: of the noise, see
+        `Sensor.capture`, by default random numbers of torch's generator.
         """
+        if index is None:
+            index = torch.randint(2**62, (len(image),))
+        centre = self.sensor.corners.mean(1, keepdim=True) if points is None else points.detach()
         size = image.new_tensor([image.shape[-1], image.shape[-2]], dtype=torch.float64)
-        first = self.sensor.pixel_of(points.detach().to(size)).T - 0.5 * (size - 1)
-        origin = (first + 1e-6).floor().long()
+        first = self.sensor.pixel_of(centre.to(size)).T - 0.5 * (size - 1)
+        origin = (first + 1e-6).floor().long().expand(len(image), 2)
         return self.sensor.demosaic(self.sensor.capture(image, index, seed, origin), origin)
 
     def target(self, picture: Tensor) -> Tensor:
-        """The ideal output: the image without its margin; with a sensor as light."""
-        picture = as_picture(picture) if self.sensor is None else linearised(picture)
-        rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
-        bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns
-        return picture[..., rows : picture.shape[-2] - bottom, columns : picture.shape[-1] - right]
+        """The ideal output (B, C, h, w): the light of the picture without its margin."""
+        edge = self.size // 2
+        light = self._light(picture)
+        return light[..., edge : light.shape[-2] - edge, edge : light.shape[-1] - edge]
 
 
 def _difference(name: str, before: object, now: object) -> str:
@@ -513,24 +481,3 @@ def _difference(name: str, before: object, now: object) -> str:
             if not alike(before.get(key), now[key]):
                 return f"a sensor of {key} {before.get(key)}, not {now[key]}"
     return f"a camera of {name} {before}, not {now}"
-
-
-def _grey(picture: Tensor, object_distances: Tensor) -> Tensor:
-    """Pictures (B, H, W) or (H, W) of object distances (B,) in [0, 1]."""
-    picture = as_picture(picture)
-    shape, count = tuple(picture.shape), len(object_distances)
-    if not (picture.dim() == 2 or (picture.dim() == 3 and (count == 1 or shape[0] in (1, count)))):
-        raise ValueError(
-            f"pictures of shape {shape} at {count} object distances: expected grey ones (B, H, W), one for each "
-            "distance; colours are a batch, as picture.flatten(0, 1) with distances.repeat_interleave(3)"
-        )
-    return _in_range(picture)
-
-
-def _in_range(picture: Tensor) -> Tensor:
-    """Raises ValueError for pictures far above 1."""
-    if (most := float(picture.detach().max())) > _LARGEST:
-        raise ValueError(
-            f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"
-        )
-    return picture

@@ -57,24 +57,19 @@ def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int =
 def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
 
-    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. With a sensor the
-    mean over its channels and the camera's field points, each with a filter of its own; with cross spectra (C, C, rows,
-    columns) the filter of each field point is joint, `joint_wiener`.
+    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. The mean over the
+    channels of the sensor and the camera's fields, each with a filter of its own; with cross spectra (C, C, rows,
+    columns) the filter of each field is joint, `joint_wiener`.
     """
-    if camera.sensor is not None:
-        kernels, spectrum = camera.kernels_over_field(distances), spectrum.to(camera.fields.device)
-        sigma = noise_deviation(camera, spectrum)
-        if spectrum.dim() == 4:
-            return joint_kernel_error(kernels, spectrum, sigma).mean()
-        return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
-    kernels = [camera.kernels(distances, field) for field in range(camera.fields.shape[1])]
-    return kernel_error(torch.cat(kernels), spectrum.to(kernels[0].dtype), camera.noise)
+    kernels, spectrum = camera.kernels_over_field(distances), spectrum.to(camera.fields.device)
+    sigma = noise_deviation(camera, spectrum)
+    if spectrum.dim() == 4:
+        return joint_kernel_error(kernels, spectrum, sigma).mean()
+    return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
 
 
-def noise_deviation(camera: Camera, spectrum: Tensor) -> float | Tensor:
-    """Standard deviation of the noise of a pixel of mean level, of every channel (C, 1, 1) with a sensor."""
-    if camera.sensor is None:
-        return camera.noise
+def noise_deviation(camera: Camera, spectrum: Tensor) -> Tensor:
+    """Standard deviation of the noise of a pixel of mean level, (C, 1, 1) of every channel, or (1, 1) of all."""
     rows, columns = spectrum.shape[-2:]
     constant = spectrum[..., 0, 0]
     mean = ((constant.diagonal().real if spectrum.dim() == 4 else constant) / (rows * columns)).sqrt()
@@ -235,7 +230,7 @@ def out_of_focus(camera: Camera) -> str:
 
 def _in_focus(camera: Camera) -> tuple[float, float]:
     """Sensor distances in mm at which an object of the range is in focus to the width of the PSF."""
-    width = float(camera.pixels.pitch.detach()) * camera.pixels.rows
+    width = camera.sensor.pitch * camera.size
     return sensor_range(camera.variables(), camera.range, fields=camera.fields, width=width)
 
 

@@ -41,8 +41,9 @@ from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
 from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
 from raytrace.maths.result import plain
-from raytrace.maths.sampling import grid, hexapolar, sobol
+from raytrace.maths.sampling import hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
+from raytrace.psf_models import DRT, Fourier, Gaussian, Paraxial, Wave, model_of
 from raytrace.settings import GAUSSIAN, CodesignSettings
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
@@ -131,10 +132,12 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | 
 
 
 @functools.lru_cache(maxsize=8)  # every batch asks for it, and its response may be a file
-def sensor_at_start(settings: CodesignSettings) -> Sensor | None:
-    """The sensor of an experiment, of whole pixels; None of a grey camera of field points."""
+def sensor_at_start(settings: CodesignSettings) -> Sensor:
+    """The sensor of an experiment, of whole pixels; without a size a grey one of a patch, with white noise alone."""
     if not settings.sensor:
-        return None
+        side = settings.patch * settings.pixel
+        pixels = (settings.patch, settings.patch)
+        return Sensor(size=(side, side), pixels=pixels, read_noise=settings.noise, saturation=math.inf)
     pixels = tuple(max(1, round(side / settings.pixel)) for side in settings.sensor)
     return Sensor(
         size=tuple(count * settings.pixel for count in pixels),
@@ -152,36 +155,36 @@ def network_at_start(settings: CodesignSettings) -> torch.nn.Module:
     shapes = {"red-net": RedNetShape, "u-net": UNetShape}
     if settings.network not in shapes:
         raise ValueError(f"network {settings.network!r}: expected {' or '.join(shapes)}")
-    sensor = sensor_at_start(settings)
     shape = shapes[settings.network](settings.depth, settings.width)
-    return network(shape, channels=1 if sensor is None else len(sensor.channels), seed=settings.seed)
+    return network(shape, channels=len(sensor_at_start(settings).channels), seed=settings.seed)
+
+
+def model_at(name: str, settings: CodesignSettings) -> Paraxial | Fourier | Gaussian | DRT | Wave:
+    """A PSF model with the numbers of an experiment: pupil points instead of `tol` where it has a number of rays."""
+    rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
+    if name == "paraxial":
+        return Paraxial(rho=settings.rho)
+    points = pupil_points(settings.sampling, rays.get(name), seed=settings.seed)
+    return model_of(name) if points is None else model_of(name, rays=points)
 
 
 def camera(lens: Lens, settings: CodesignSettings) -> Camera:
     """The camera of an experiment at its start."""
-    like, sensor = lens.wavelengths, sensor_at_start(settings)
-    if sensor is not None and settings.is_toleranced:
-        raise ValueError("a lens as built in front of a sensor: expected grade, limits and as_built without sensor")
-    fields = torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)])
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
-    rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
     return Camera(
         variables(lens, settings),
         network_at_start(settings).to(memory_format=torch.channels_last),
-        model=settings.model,
+        sensor=sensor_at_start(settings),
+        model=model_at(settings.model, settings),
         object_distances=(settings.near, settings.far),
-        fields=fields if sensor is None else None,
-        pixels=grid(like.new_tensor(settings.pixel), settings.size) if sensor is None else settings.size,
+        fields=None if settings.sensor else settings.fields,
+        pixels=settings.size,
         normalise=settings.normalise,
-        noise=settings.noise,
         tol=settings.tol,
-        rho=settings.rho,
         network_dtype=torch.bfloat16 if settings.precision == "bfloat16" else None,
-        pupil_points=pupil_points(settings.sampling, rays.get(settings.model), seed=settings.seed),
         center=settings.center or ("centroid" if settings.is_toleranced else "chief"),
         tolerances=tolerances_at_start(lens, settings),
-        sensor=sensor,
     )
 
 
@@ -207,7 +210,8 @@ def with_catalog_glasses(trained: Camera, settings: CodesignSettings) -> tuple[C
 def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
     """Prepare step 2: a fixed lens and its DRT PSFs, over the whole pupil or of the `drt_rays`."""
     camera.variables.requires_grad_(False)
-    camera.use("drt", pupil_points(settings.sampling, settings.drt_rays, seed=settings.seed))
+    points = pupil_points(settings.sampling, settings.drt_rays, seed=settings.seed)
+    camera.use("drt" if points is None else DRT(rays=points))
 
 
 # -- training
@@ -215,33 +219,33 @@ def freeze_lens(camera: Camera, settings: CodesignSettings) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Samples of one step: picture (B, H, W) float32, distance (B,) mm float64, noise (B, h, w) of deviation 1.
+    """Samples of one step: picture (B, C, H, W) float32, distance (B,) mm float64; index (B,), seed: of their noise.
 
-    errors: of manufacture, (B, N) or (N,) of one lens, float64; None of the nominal lens.
-    Of a sensor: picture (B, C, H, W), light; points (2, B) mm of the patches; index (B,), seed: of their noise.
+    field: (B,) numbers of the camera's fields, or points: (2, B) mm on the sensor; errors: of manufacture, (B, N) or
+    (N,) of one lens, float64; None of the nominal lens.
     """
 
     picture: Tensor
     distance: Tensor
-    noise: Tensor | None
+    index: Tensor
+    seed: int
     field: list[int]
-    errors: Tensor | None = None
     points: Tensor | None = None
-    index: Tensor | None = None
-    seed: int = 0
+    errors: Tensor | None = None
 
     def to(self, device: torch.device) -> Self:
-        """The same on a device; index and seed remain plain numbers."""
+        """The same on a device; field, index and seed remain plain numbers."""
         if self.picture.device == device:
             return self
-        names = ("picture", "distance", "noise", "errors", "points")
+        names = ("picture", "distance", "errors", "points")
         moved = {name: getattr(self, name).to(device) for name in names if getattr(self, name) is not None}
         return dataclasses.replace(self, **moved)
 
-    def part(self, where: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Picture, distance, noise and errors of some samples."""
-        errors = self.errors if self.errors is None or self.errors.dim() == 1 else self.errors[where]
-        return self.picture[where], self.distance[where], self.noise[where], errors
+    @property
+    def capture(self) -> dict:
+        """Place, errors and noise of the samples, as a camera takes them."""
+        names = ("field", "points", "errors", "index", "seed")
+        return {name: getattr(self, name) for name in names}
 
 
 def batch(
@@ -263,19 +267,21 @@ def batch(
             distance = random.uniform(settings.near, settings.far)
         else:
             distance = 1 / random.uniform(1 / settings.far, 1 / settings.near)
-        parts.append((patch, distance, random.standard_normal((settings.patch,) * 2, dtype=np.float32)))
-    picture, distance, noise = (torch.as_tensor(np.stack(part)) for part in zip(*parts, strict=True))
-    errors, count = None, len(pictures) * settings.crops
-    if (sensor := sensor_at_start(settings)) is not None:
-        index = epoch * count + torch.tensor(samples)
+        parts.append((patch, distance))
+    picture, distance = (torch.as_tensor(np.stack(part)) for part in zip(*parts, strict=True))
+    count, numbers, points, errors = len(pictures) * settings.crops, torch.tensor(samples), None, None
+    index, sensor = epoch * count + numbers, sensor_at_start(settings)
+    if settings.sensor:
+        picture = light_of(picture)
         points = sensor.patch_points(sensor.random_patches(index, settings.patch, settings.seed), settings.patch)
-        where = {"points": points, "index": index, "seed": settings.seed}
-        return Batch(light_of(picture), distance, None, [0] * len(samples), **where)
+    else:
+        picture = picture[:, None]
     if tolerances is not None:
         first, last = min(samples), max(samples)
         drawn = draw_errors(tolerances, last - first + 1, settings.seed, first=epoch * count + first)
-        errors = drawn[torch.tensor(samples) - first]
-    return Batch(picture, distance, noise, [sample % len(settings.fields) for sample in samples], errors)
+        errors = drawn[numbers - first]
+    field = [sample % len(settings.fields) for sample in samples]
+    return Batch(picture, distance, index, settings.seed, field, points, errors)
 
 
 def spectrum_of(pictures: Pictures, settings: CodesignSettings) -> Tensor:
@@ -334,22 +340,8 @@ def absolute_error(camera: Camera, batch: Batch) -> Tensor:
 def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor]) -> list[Tensor]:
     """Σ over pixels of measures of restored - picture, each (B,); of several channels their mean."""
     batch = batch.to(camera.fields.device)
-    if camera.sensor is not None:
-        where = {"points": batch.points, "index": batch.index, "seed": batch.seed}
-        difference = camera(batch.picture, batch.distance, **where) - camera.target(batch.picture)
-        return [measure(difference).mean(-3).sum((-2, -1)) for measure in measures]
-    if len(camera.fields[0]) == 1:
-        restored = camera(batch.picture, batch.distance, noise=batch.noise, errors=batch.errors)
-        difference = restored - camera.target(batch.picture)
-        return [measure(difference).sum((-2, -1)) for measure in measures]
-    sums = [batch.picture.new_zeros(len(batch.field)) for _ in measures]
-    for field in sorted(set(batch.field)):
-        where = torch.tensor([i for i, number in enumerate(batch.field) if number == field])
-        picture, distance, noise, errors = batch.part(where)
-        difference = camera(picture, distance, field=field, noise=noise, errors=errors) - camera.target(picture)
-        parts = [measure(difference).sum((-2, -1)) for measure in measures]
-        sums = [total.index_put((where,), part) for total, part in zip(sums, parts, strict=True)]
-    return sums
+    difference = camera(batch.picture, batch.distance, **batch.capture) - camera.target(batch.picture)
+    return [measure(difference).mean(-3).sum((-2, -1)) for measure in measures]
 
 
 def optimise(
@@ -417,7 +409,7 @@ def held_out_error(
 def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
     """Σ |filtered - picture| of every sample behind linear filters (C, rows, columns), (B,)."""
     batch = batch.to(camera.fields.device)
-    image = camera.image(batch.picture, batch.distance, points=batch.points)
+    image = camera.image(batch.picture, batch.distance, batch.field, batch.errors, points=batch.points)
     recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
     apply = restore_jointly if filters.dim() == 4 else restore
     restored = apply(recorded, filters.to(torch.complex64), boundary="taper")
@@ -508,7 +500,7 @@ def run_model(
     folder = Path(folder)
 
     def run(step: str) -> Run:  # raises OtherSettings
-        document = {**dataclasses.asdict(settings), **about, "step": step}
+        document = {**dataclasses.asdict(settings), **about, "part": step}
         return Run(folder / step, document, usual=usual(settings))
 
     joint = run(STEPS[0])
@@ -538,7 +530,7 @@ def run_model(
         found = errors_as_built(trained, test_pictures, settings, progress=progress)
         built = [{str(number): error for number, error in enumerate(errors.tolist(), 1)} for errors in found]
     of_places = {}
-    if trained.sensor is not None:
+    if settings.sensor:
         filters = field_filters(trained, spectrum_of(train_pictures, settings), PLACES)
         of_places = {
             "l1_by_place": {

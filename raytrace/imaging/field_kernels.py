@@ -4,6 +4,8 @@ Rows of a kernel grow towards +y of the sensor and columns towards -x, as the ro
 A kernel has its origin where the chief ray of the primary wavelength meets the sensor, and sums to 1: the light that
 arrives is the relative illumination, an image of its own. Where no chief ray or no light arrives a kernel is 0.
 
+A place is a point of the sensor, whose field point changes with the lens, or a field point, whose image moves with it.
+
 Of a rotationally symmetric lens and the Gaussian model, centroids and covariances along one radius are turned to every
 place. Kernels of the other models are computed in one octant and mirrored to the others.
 
@@ -15,6 +17,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -24,10 +27,10 @@ from raytrace.imaging.sensor import Sensor
 from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
-from raytrace.psf_models import MODELS, NotConverged, model_of, psf
+from raytrace.psf_models import MODELS, Execution, NotConverged, model_of, psf
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.psf_models.models import is_sampled_in_common
-from raytrace.system.lens import Lens, is_round_about_axis, with_field_kind, with_object_distance
+from raytrace.system.lens import Lens, is_round_about_axis, one_lens, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import field_of_object
 from raytrace.tracing.paraxial import axial_beam
@@ -68,7 +71,10 @@ class FieldKernels:
     model, order: of the PSF; size: of the window, an odd number of pixels; object_distances: (D,) mm; weights: (C, W),
     the share of every wavelength of the lens in a channel; lateral_colour: whether the light of other wavelengths lies
     where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
-    traced; elements: in contact at the stop, with the model "wave". Raises ValueError for elements and another model.
+    traced; elements: in contact at the stop, with the model "wave"; parameters: of the model, as Paraxial(rho=0.4), or
+    Gaussian(rays=points), pupil points in place of an order; center: of the window, "chief" or "centroid" (of the
+    light); normalise: "window", kernels of sum 1, or "energy", of the share of the light through the entrance pupil;
+    memo: of rays, for loops over the same field points. Raises ValueError for elements and another model.
     """
 
     lens: Lens
@@ -81,6 +87,10 @@ class FieldKernels:
     lateral_colour: bool = True
     nodes: int = 33
     elements: tuple[Element, ...] = ()
+    parameters: object = None
+    center: Literal["chief", "centroid"] = "chief"
+    normalise: Literal["window", "energy"] = "window"
+    memo: Memo | None = None
 
     def __post_init__(self):
         check_model(self.model, self.elements)
@@ -91,12 +101,29 @@ class FieldKernels:
         return torch.cat([part._of_one_distance(points) for part in parts], 1)
 
     def paired(self, points: Tensor) -> Tensor:
-        """Kernels (N, C, size, size) at places (2, N) mm, each of its own of the object distances (N,)."""
+        """Kernels (N, C, size, size) at points (2, N) mm, each of its own of the object distances (N,)."""
         parts, order = [], []
         for group in self._groups():
             kernels = dataclasses.replace(self, object_distances=self.object_distances[group])
             parts.append(kernels._paired(points[:, group]))
             order.append(group)
+        return torch.cat(parts)[torch.cat(order).argsort()]
+
+    def of_pairs(self, fields: Tensor) -> Tensor:
+        """Kernels (N, C, size, size) of field points (2, N), each of its own of the object distances (N,), and of the
+        lenses of a batch of N."""
+        if not MODELS[self.model].traces:  # first-order models image all fields alike
+            fields = torch.zeros_like(fields)
+        finite = self.object_distances.detach().isfinite().to(fields)
+        which = torch.unique(torch.stack([*fields.detach(), finite]), dim=1, return_inverse=True)[1]
+        parts, order = [], []
+        for number in which.unique():
+            group = torch.nonzero(which == number)[:, 0]
+            for some in group.split(1 if is_sampled_in_common(self.lens, self.model) else len(group)):
+                lens = self.lens if self.lens.count is None else one_lens(self.lens, some)
+                kernels = dataclasses.replace(self, lens=lens, object_distances=self.object_distances[some])
+                parts.append(kernels.of_fields(fields[:, some[:1]])[0])
+                order.append(some)
         return torch.cat(parts)[torch.cat(order).argsort()]
 
     def _groups(self) -> list[Tensor]:
@@ -127,8 +154,14 @@ class FieldKernels:
 
     @property
     def _has_radii(self) -> bool:
-        """Whether all azimuths of a radius have the same moments."""
-        return self.model == "gaussian" and is_round_about_axis(self.lens)
+        """Whether all azimuths of a radius have the same moments, about the chief ray, in kernels of sum 1."""
+        how = self.center, self.normalise, has_points(self.parameters)
+        return self.model == "gaussian" and how == ("chief", "window", False) and is_round_about_axis(self.lens)
+
+    @property
+    def _model(self) -> object:
+        parameters = model_of(self.model) if self.parameters is None else self.parameters
+        return parameters if has_points(parameters) else dataclasses.replace(parameters, order=self.order)
 
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
@@ -154,27 +187,37 @@ class FieldKernels:
     def _in_parts(self, points: Tensor) -> Tensor:
         """By the PSF model, field by field; the chief rays of all places are aimed and traced at once."""
         fields = self.sensor.fields(self.lens, points) if MODELS[self.model].traces else points
-        arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
+        arrives = ~fields.isnan().any(0)
+        kernels = self.of_fields(fields.nan_to_num(0.0), of_points=True)
+        return torch.where(arrives[:, None, None, None, None], kernels, 0.0)
+
+    def of_fields(self, fields: Tensor, *, of_points: bool = False) -> Tensor:
+        """Kernels (F, D, C, size, size) of field points (2, F); of a batch of D lenses one for each.
+
+        By the PSF model, field by field; the chief rays of all fields are aimed and traced at once. of_points: the
+        field points are those of points of the sensor, which vary with the lens.
+        """
         count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
         kernels = []
         for part, origin in zip(fields.split(count, 1), self.origin(fields).split(count, 2), strict=True):
-            light = _of_sum_1(self.light(part, origin)) if self.elements else self._of_model(part, origin)
+            if of_points and MODELS[self.model].in_common and not varies(part):
+                # Field points that vary break symmetry: one sampling, with derivatives or not.
+                part = part.detach().requires_grad_()
+            light = self.light(part, origin) if self.elements else self._of_model(part, origin)
             light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
-            kernels.append(_of_sum_1(light))
-        return torch.where(arrives[:, None, None, None, None], torch.cat(kernels), 0.0)
+            kernels.append(light if self.normalise == "energy" else _of_sum_1(light))
+        return torch.cat(kernels)
 
     def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
-        """(D, F, W, h, w) of sum 1, 0 without light, columns towards +x."""
+        """Light (D, F, W, h, w), columns towards +x; 1 = all through the entrance pupil."""
         numbers = pytree.tree_leaves((self.lens, self.object_distances))
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
-            if MODELS[self.model].in_common and not varies(fields):
-                # Fields of places vary with the lens, which breaks symmetry: one sampling, with derivatives or not.
-                fields = fields.detach().requires_grad_()
-            about = {"fields": fields, "object_distances": self.object_distances}
-            about |= {"normalise": "window", "center": "axis", "per_wavelength": True}
-            model, kernels = model_of(self.model, order=self.order), []
+            about = {"fields": fields, "object_distances": self.object_distances, "per_wavelength": True}
+            about |= {"center": "axis" if self.center == "chief" else "centroid"}
+            about |= {"execution": Execution(memo=self.memo)}
+            kernels = []
             for wavelengths, window in self._windows(origin):
-                kernels.append(psf(self.lens, model, **about, grid=window, wavelengths=wavelengths).kernel)
+                kernels.append(psf(self.lens, self._model, **about, grid=window, wavelengths=wavelengths).kernel)
             return torch.cat(kernels, 2)
 
     def light(self, fields: Tensor, origin: Tensor) -> Tensor:
@@ -191,6 +234,8 @@ class FieldKernels:
         """Wavelengths with a common origin, µm, and their pixels about it, whose centres are (2, D, F)."""
         wavelengths, pitch = self.lens.wavelengths, origin.new_tensor(self.sensor.pitch)
         groups = [wavelengths] if self.lateral_colour else wavelengths.split(1)
+        if self.center == "centroid":
+            origin = torch.zeros_like(origin)
         for some, centre in zip(groups, origin.unbind(-1), strict=True):
             yield some, make_grid(pitch, self.size, centre)
 
@@ -247,15 +292,17 @@ class FieldKernels:
         fields = self.sensor.fields(self.lens, points)
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
         about = {"fields": fields, "object_distances": self.object_distances, "per_wavelength": True}
-        spots = psf(
-            self.lens, model_of("gaussian", order=self.order), **about, grid=make_grid(radii.new_tensor(1.0), 1)
-        )
+        spots = psf(self.lens, self._model, **about, grid=make_grid(radii.new_tensor(1.0), 1))
         moments = spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2]
         known = arrives[:, None] & ~spots.centroid[1].isnan()
         return *(torch.where(known, moment, 0.0) for moment in moments), known.to(radii)
 
     def origin(self, fields: Tensor) -> Tensor:
         """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1 or W), see `origin`."""
+        if not varies(fields) and not bool(fields.any()) and is_round_about_axis(self.lens):
+            return fields.new_zeros(2, len(self.object_distances), fields.shape[1], 1).expand(
+                -1, -1, -1, 1 if self.lateral_colour else len(self.lens.wavelengths)
+            )
         return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
 
 
@@ -306,6 +353,10 @@ class ElementKernels:
         distances, which = _distinct(self.object_distances)
         return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
 
+    def of_pairs(self, fields: Tensor) -> Tensor:
+        """The same of field points (2, N)."""
+        return self.paired(fields)
+
 
 def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
     """Distances without repetition, and each one's number among them; all of them where they vary."""
@@ -342,13 +393,23 @@ def field_kernels(
     weights: Tensor,
     lateral_colour: bool = True,
     elements: Sequence[Element] = (),
+    **more,
 ) -> FieldKernels | ElementKernels:
-    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone."""
+    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone.
+
+    more: further fields of `FieldKernels`.
+    """
     elements = tuple(elements)
     if elements and is_stop_alone(lens):
         check_model(model, elements)
         return ElementKernels(lens, elements, sensor, size, object_distances, weights)
-    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements)
+    how = {"lateral_colour": lateral_colour, "elements": elements, **more}
+    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, **how)
+
+
+def has_points(parameters: object) -> bool:
+    """Whether the parameters of a PSF model are pupil points of their own rays."""
+    return isinstance(getattr(parameters, "rays", None), Tensor)
 
 
 def check_model(model: str, elements: Sequence[Element]) -> None:
@@ -500,49 +561,52 @@ def order_of(
     lens: Lens,
     sensor: Sensor,
     model: str,
-    points: Tensor,
+    fields: Tensor,
     object_distances: Tensor,
     size: int,
     tol: float,
     *,
     elements: Sequence[Element] = (),
+    center: Literal["chief", "centroid"] = "chief",
+    parameters: object = None,
 ) -> int:
-    """The order of the model that meets the tolerance at places (2, N) mm of the sensor.
+    """The order of the model that meets the tolerance at field points (2, F); those that are nan do not count.
 
-    Of elements at the stop of a lens: the lowest order from which the next differs by less. Elements alone have none.
+    Of elements at the stop of a lens: the lowest order from which the next differs by less. Elements alone have none,
+    and pupil points among the parameters of the model have none.
     """
     if not MODELS[model].traces and len(MODELS[model].orders) == 1:
         return MODELS[model].orders[0]
-    if elements and is_stop_alone(lens):
+    if has_points(parameters) or (elements and is_stop_alone(lens)):
         return 0
     with torch.no_grad():
+        fields = fields[:, ~fields.isnan().any(0)] if MODELS[model].traces else torch.zeros_like(fields[:, :1])
         if elements:
-            return _order_of_elements(lens, sensor, model, points, object_distances, size, tol, elements)
-        fields = sensor.fields(lens, points) if MODELS[model].traces else torch.zeros_like(points[:, :1])
-        fields = fields[:, ~fields.isnan().any(0)]
+            return _order_of_elements(lens, sensor, model, fields, object_distances, size, tol, elements)
         # Width and light in the window determine the error of a Gaussian: a single pixel is enough.
         pitch, size = (sensor.pitch * size, 1) if MODELS[model].by_width else (sensor.pitch, size)
-        about = {"center": "chief", "grid": make_grid(points.new_tensor(pitch), size), "tol": tol}
+        about = {"center": center, "grid": make_grid(fields.new_tensor(pitch), size), "tol": tol}
         about |= {"object_distances": object_distances}
-        # Each place alone: a clipped beam has more rays of an order than the beams of other places.
-        return max(psf(lens, model, fields=field, **about).order for field in fields.split(1, 1))
+        # Each field alone: a clipped beam has more rays of an order than the beams of other fields.
+        return max(psf(lens, parameters or model, fields=field, **about).order for field in fields.split(1, 1))
 
 
 def _order_of_elements(
     lens: Lens,
     sensor: Sensor,
     model: str,
-    points: Tensor,
+    fields: Tensor,
     distances: Tensor,
     size: int,
     tol: float,
     elements: Sequence[Element],
 ) -> int:
-    weights, before = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(points), None
+    weights, before = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(fields), None
     for order in MODELS[model].orders:
         kernels = field_kernels(lens, sensor, model, order, size, distances, weights, elements=elements)
         try:
-            light = kernels.at(points)
+            parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
+            light = torch.cat([part.of_fields(fields) for part in parts], 1)
         except hybrid.TooCoarse:
             if before is None:
                 raise

@@ -481,7 +481,7 @@ def _model_of(
         window = size or window_size(lens, sensor, name, corners, distances, **how, tol=tol)
         if order is not None:
             return name, order, window
-        about = lens, sensor, name, diagonal, distances, window, _MODEL * tol
+        about = lens, sensor, name, sensor.fields(lens, diagonal), distances, window, _MODEL * tol
         return name, order_of(*about, elements=how["elements"]), window
 
     if model is not None:
@@ -562,7 +562,7 @@ def _image_circle(lens: Lens, sensor: Sensor, like: Tensor, edge: float | None =
 
 
 def _has_light(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
-    return _illumination_at(lens, sensor, points) > _FAINT
+    return illumination_at(lens, sensor, points) > _FAINT
 
 
 def _radius(circle: tuple[Tensor, Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
@@ -700,13 +700,14 @@ def _illumination(
     """
     if pixels is not None:
         nodes = radii(pixels, _LIT)
-        return along(nodes, _illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), pixels)
-    grid = _illumination_at(lens, sensor, _within(circle, _places(sensor, _FIT, _FIT, like))).reshape(_FIT, _FIT)
+        return along(nodes, illumination_at(lens, sensor, torch.stack([torch.zeros_like(nodes), nodes])), pixels)
+    grid = illumination_at(lens, sensor, _within(circle, _places(sensor, _FIT, _FIT, like))).reshape(_FIT, _FIT)
     across, down = (bilinear(count, 0, _FIT, like=like) for count in sensor.pixels)
     return down.T @ grid @ across
 
 
-def _illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+def illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
+    """Relative illumination (N,) at points (2, N) mm of the sensor; 0 where no light arrives."""
     fields = sensor.fields(lens, points)
     arrives = ~fields.isnan().any(0)
     values = torch.zeros_like(fields[0, arrives])
@@ -908,11 +909,7 @@ def patch_kernels(
     illumination: bool = False,
 ) -> Tensor:
     """Kernels (B, C, size, size) of the channels at points (2, B) mm; arguments as for `render_patches`."""
-    if not bool(torch.isfinite(points.detach()).all()):
-        count = int((~torch.isfinite(points.detach())).any(0).sum())
-        raise ValueError(
-            f"{count} of {points.shape[1]} points are nan or infinite: expected places of the sensor in mm"
-        )
+    check_points(points, points.shape[-1])
     distances = like = lens.surfaces[0].thickness
     if object_distances is not None:
         distances = torch.as_tensor(object_distances, dtype=like.dtype, device=like.device)
@@ -925,7 +922,16 @@ def patch_kernels(
     kernels = field_kernels(lens, sensor, model, order, size, distances, weights, lateral_colour, elements)
     kernels = kernels.paired(points)
     warn_of_dark_places(kernels, points)
-    return _illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
+    return illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
+
+
+def check_points(points: Tensor, count: int) -> None:
+    """Raise ValueError for places (2, count) mm of another shape, or that are not finite."""
+    if tuple(points.shape) != (2, count):
+        raise ValueError(f"points of shape {tuple(points.shape)}: expected (2, {count}) mm, a place for each image")
+    if not bool(torch.isfinite(points.detach()).all()):
+        beyond = int((~torch.isfinite(points.detach())).any(0).sum())
+        raise ValueError(f"{beyond} of {count} points are nan or infinite: expected places of the sensor in mm")
 
 
 def _check_distances(distances: Tensor, count: int) -> None:

@@ -47,6 +47,7 @@ class Sensor:
     full_well: electrons at level 1, where pixels saturate; None: no shot noise.
     read_noise: standard deviation in electrons; without a full well a fraction of level 1.
     bits: of the quantisation; None: continuous levels.
+    saturation: level at which pixels saturate; inf: never.
     black_level: offset of the quantisation, in the unit of the read noise: the 2^bits levels reach from -black_level to
         the full well, so that the noise of dark pixels keeps its mean and variance; None: five times the read noise.
 
@@ -67,6 +68,7 @@ class Sensor:
     bits: int | None = None
     offset: tuple[float, float] = (0.0, 0.0)
     black_level: float | None = None
+    saturation: float = 1.0
 
     def __post_init__(self):
         for name, kind, expected in (
@@ -110,6 +112,10 @@ class Sensor:
             )
         if self.black_level is not None and not 0 <= self.black_level < math.inf:
             raise ValueError(f"black_level {self.black_level!r}: expected 0 or more, in the unit of the read noise")
+        if not self.saturation >= 1 or (self.bits is not None and self.saturation != 1):
+            raise ValueError(
+                f"saturation {self.saturation!r}: expected 1, the level of the full well; without bits more, or inf"
+            )
         if self.bits is not None and (self.bits != int(self.bits) or not 1 <= self.bits <= 32):
             raise ValueError(f"bits {self.bits!r}: expected a whole number from 1 to 32; None for continuous levels")
 
@@ -269,13 +275,13 @@ class Sensor:
     ) -> Tensor:
         """The recorded picture (..., C, H, W), or its mosaic (..., 1, H, W), of irradiance (..., C, H, W).
 
-        irradiance: relative to saturation: level 1 fills the full well; integers of 8 or 16 bits are scaled to 0 … 1.
+        irradiance: level 1 fills the full well; integers of 8 or 16 bits are scaled to 0 … 1.
         index: global numbers (...) of the pictures, by default 0, 1, …: the noise of a picture depends on seed and
         index alone (of one dtype and shape, on one kind of device). origin: (column, row) of the first pixel on the
         sensor, or (..., 2).
 
         In this order: mosaic; shot noise, Poisson (`count_electrons`), or, where a derivative by the irradiance may be
-        requested, its Gaussian approximation with its derivative (`add_shot_noise`); read noise; saturation at 1;
+        requested, its Gaussian approximation with its derivative (`add_shot_noise`); read noise; saturation;
         quantisation (`digitise`) from -black_level on, which the derivative ignores. Dark pixels have a mean of 0:
         levels below 0 remain, to -black_level with bits. Raises ValueError.
         """
@@ -291,13 +297,13 @@ class Sensor:
             noisy = [self._noisy(one, _generator(seed, number, picture.device)) for one, number in each]
             picture = torch.stack(noisy).reshape(picture.shape)
         if self.bits is None:
-            return picture.clamp(max=1.0)
+            return picture.clamp(max=self.saturation)
         black = self.black
         return (1 + black) * digitise((picture + black) / (1 + black), self.bits) - black
 
     @property
     def black(self) -> float:
-        """The black level relative to saturation."""
+        """The black level relative to level 1."""
         black = _BLACK * self.read_noise if self.black_level is None else self.black_level
         return black / (self.full_well or 1.0)
 

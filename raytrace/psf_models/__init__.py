@@ -34,6 +34,7 @@ from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.models import Paraxial as Paraxial
 from raytrace.psf_models.models import Wave as Wave
 from raytrace.psf_models.models import model_of as model_of
+from raytrace.psf_models.models import name_of as name_of
 from raytrace.psf_models.models import psf as psf
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels

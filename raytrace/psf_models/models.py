@@ -218,6 +218,11 @@ def model_of(name: str, **numbers) -> Paraxial | Fourier | Gaussian | DRT | Wave
     return MODELS[name].parameters(**numbers)
 
 
+def name_of(parameters: Paraxial | Fourier | Gaussian | DRT | Wave) -> str:
+    """The name of a model that is given with its numbers."""
+    return next(name for name, model in MODELS.items() if isinstance(parameters, model.parameters))
+
+
 def psf(
     lens: Lens,
     model: str | Paraxial | Fourier | Gaussian | DRT | Wave = "auto",
@@ -267,7 +272,7 @@ def psf(
     """
     execution = execution or Execution()
     center = center or ("chief" if fields is None or grid is None else "axis")
-    name = model if isinstance(model, str) else next(k for k, m in MODELS.items() if isinstance(model, m.parameters))
+    name = model if isinstance(model, str) else name_of(model)
     for parameter, (word, words) in {
         "model": (name, ("auto", *MODELS)),
         "center": (center, ("axis", "chief", "centroid")),
