@@ -1,7 +1,7 @@
 """The commands of `raytrace`: a row each, with summary, description, examples and options. Imports no torch.
 
 A command calls the function of the public API that has its name. An option's destination is the name of that function's
-parameter. A new command is a new row. Commands that do more than call the function once have a function `run`.
+parameter. A new command is a new row. A command that does more than call the function once names its own in `run`.
 """
 
 import argparse

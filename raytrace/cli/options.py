@@ -1,7 +1,7 @@
 """The table of options, and what groups them. Imports no torch, so that --help answers at once.
 
 A row is an `Option`. OPTIONS has the rows that several commands share: a command names them by their parameter, and
-`row(name, …)` is one of them with another text, default or type. A command's further rows are in its row of
+`row(name, …)` is one of them with another text, default or reader. A command's further rows are in its row of
 `commands.COMMANDS`. Docstrings and annotations of the functions are not read; `tests/test_cli_options.py` compares the
 rows with the signatures.
 """
@@ -27,6 +27,7 @@ from raytrace.cli.types import (
     positive_finite,
     seed_number,
 )
+from raytrace.settings import GRADES
 
 #: Adds options to a parser or to a group of its options.
 Adder: TypeAlias = Callable[[argparse._ActionsContainer], object]
@@ -79,8 +80,6 @@ def switch(name: str, help: str, *, flag: str = "", default: bool | None = False
 
 #: PSF models in order of fidelity.
 MODELS = ("paraxial", "fourier", "gaussian", "drt", "wave")
-GRADES = ("commercial", "precision", "high")
-SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
 
 #: Options that several commands have.
 OPTIONS: dict[str, Option] = {row.name: row for row in (
@@ -120,7 +119,7 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("field_weights", positive_finite, "W", "one for each field", nargs="+"),
     Option("wavelength_weights", positive_finite, "W", "one for each wavelength", nargs="+"),
     Option("sampling", help="rule of the pupil points: Gaussian quadrature (gauss, default), or another",
-           choices=SAMPLINGS, default="gauss"),
+           choices=("gauss", "hexapolar", "square", "sobol", "random"), default="gauss"),
     Option("rings", count, "N", "rings of the pupil, of gauss and hexapolar (default 12)"),
     Option("points", count, "N", "points of the pupil: across it of square (default 32), in all of sobol and random "
            "(default 1024)"),
