@@ -79,6 +79,6 @@ def setup(app):
     outside the time limits of the cells."""
     from generate import write
 
-    raytrace.prepare()
+    raytrace.tracing.prepare()
     app.connect("builder-inited", write)
     app.connect("autodoc-process-docstring", paragraphs)

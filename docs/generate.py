@@ -48,7 +48,7 @@ def operands() -> str:
     text = f"""# Operands of merit functions
 
 {len(rows)} operands, by the names of OpticStudio. Lengths are in the unit of the lens file. A function of a lens in
-Python is an operand too: `rt.Measure`.
+Python is an operand too: `rt.optimization.Measure`.
 
 | operand | value | convention |
 |---|---|---|

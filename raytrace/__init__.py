@@ -11,8 +11,11 @@ name of a shipped lens (`raytrace.public`).
 """
 
 import importlib
+import warnings
+from collections.abc import Callable
 from threading import RLock
 from types import FunctionType
+from typing import Any
 
 #: Public names, and where each is defined: "package.module", or "package.module:name" if it has another name there.
 PUBLIC = {
@@ -30,9 +33,6 @@ PUBLIC = {
     "Pose": "system.poses",
     "Surface": "system.surface",
     "SystemAperture": "system.lens",
-    "BadPrescription": "system.prescription",
-    "LensFileError": "io",
-    "UnsupportedSurface": "io",
     "check": "optimization.file_check",
     "convert": "io",
     "lens": "system.prescription",
@@ -45,7 +45,6 @@ PUBLIC = {
     "AIR": "materials.glass",
     "MIRROR": "materials.glass",
     "Glass": "materials.glass",
-    "UnknownGlass": "materials.catalogs",
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
@@ -57,11 +56,7 @@ PUBLIC = {
     "BaseRay": "tracing.base_ray",
     "FirstOrder": "tracing.paraxial",
     "Rays": "system.rays",
-    "LostRays": "tracing.ray_failures",
-    "NoFocus": "analysis.focus_report",
-    "OutOfReach": "tracing.ray_failures",
     "Spot": "tracing.spot",
-    "UnfilledStop": "tracing.launch",
     "base_ray": "tracing.base_ray",
     "batch": "system.lens",
     "first_order": "tracing.paraxial",
@@ -81,26 +76,22 @@ PUBLIC = {
     "trace": "tracing.ray_listing",
     "trace_engine": "tracing.compiled",
     # optimisation
-    "BadMerit": "optimization.merit",
     "Condition": "optimization.problem",
     "Measure": "optimization.operands.operand",
     "DefaultMerit": "optimization.merit",
     "Merit": "optimization.merit",
     "Conventions": "optimization.operands.operand",
-    "NoProblem": "optimization.problem",
     "Optimized": "optimization.optimize",
     "Row": "system.optimization_data",
     "Vary": "system.optimization_data",
     "evaluate": "optimization.evaluate",
     "Jacobian": "tolerancing.jacobian",
     "jacobian": "tolerancing.jacobian",
-    "BadSearch": "optimization.search_tasks",
     "Searched": "optimization.search",
     "optimize": "optimization.optimize",
     "search": "optimization.search",
     # errors of manufacture
     "AsBuilt": "tolerancing.as_built",
-    "BadTolerance": "tolerancing.tolerances",
     "Compensator": "system.tolerance_data",
     "Tolerance": "system.tolerance_data",
     "Tolerances": "tolerancing.tolerances",
@@ -121,8 +112,6 @@ PUBLIC = {
     "Paraxial": "psf_models",
     "Psf": "psf_models",
     "Wave": "psf_models",
-    "Incomplete": "analysis.setting",
-    "NothingToShow": "analysis.setting",
     "compare": "analysis.compare",
     "distortion": "analysis.chief",
     "distortion_grid": "analysis.grid",
@@ -145,9 +134,9 @@ PUBLIC = {
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
-    "element": "wave_optics.element",
+    "phase_element": "wave_optics.element",
     "element_lens": "wave_optics.hybrid",
-    "elements": "wave_optics.compute",
+    "phase_elements": "wave_optics.compute",
     "fabricated": "wave_optics.fabrication",
     "hybrid_psf": "wave_optics.hybrid",
     "read_element": "wave_optics.element_files",
@@ -183,25 +172,170 @@ PUBLIC = {
     "train": "imaging.training",
 }
 
-__all__ = [*PUBLIC]
+#: Errors and warnings, and where each is defined.
+ERRORS = {
+    "Aliased": "psf_models.dft",
+    "AliasedSampling": "wave_optics.plan",
+    "AmbiguousGlass": "materials.catalogs",
+    "ArrayError": "maths.arrays",
+    "BadCheckpoint": "optimization.checkpoint",
+    "BadHold": "optimization.variables",
+    "BadLimits": "system.parameter_paths",
+    "BadMerit": "optimization.merit",
+    "BadPrescription": "system.prescription",
+    "BadRow": "optimization.operands.operand",
+    "BadSearch": "optimization.search_tasks",
+    "BadSettings": "cli.settings",
+    "BadSubstitute": "io.source",
+    "BadTolerance": "tolerancing.tolerances",
+    "BadVariables": "system.parameter_paths",
+    "Bent": "tracing.trace",
+    "BeyondFields": "imaging.render",
+    "CatalogError": "materials.agf",
+    "CatalogWarning": "materials.agf",
+    "ChangesNothing": "tracing.ray_listing",
+    "Circle": "optimization.merit",
+    "ClippedBeam": "analysis.sheared_batch",
+    "CommandError": "cli.run",
+    "DamagedLine": "stores",
+    "DamagedRun": "imaging.training",
+    "DarkPlaces": "imaging.field_kernels",
+    "EmptyPsf": "psf_models.result",
+    "EmptyPupil": "psf_models.dft",
+    "EmptySpot": "tracing.spot",
+    "FailedElsewhere": "shards",
+    "HeightMapError": "wave_optics.height_maps",
+    "ImplausibleWavelength": "materials.glass",
+    "Incomplete": "analysis.setting",
+    "InvalidIndex": "materials.glass",
+    "LensFileError": "io.source",
+    "LensFileWarning": "io.source",
+    "LostRays": "tracing.ray_failures",
+    "MarginalRayLost": "tracing.launch",
+    "MissingExtra": "viewer.server",
+    "NoCompiler": "tracing.compiler",
+    "NoDerivatives": "tolerancing.jacobian",
+    "NoFocus": "analysis.focus_report",
+    "NoImage": "tracing.focus",
+    "NoLight": "optimization.problem",
+    "NoMelt": "materials.glass",
+    "NoOptimum": "optimization.least_squares",
+    "NoPictures": "imaging.pictures",
+    "NoProblem": "optimization.problem",
+    "NoStep": "optimization.least_squares",
+    "NoThermalCoefficients": "materials.environment",
+    "NotConverged": "psf_models.models",
+    "NotFinite": "imaging.training",
+    "NotReached": "optimization.optimize",
+    "NotWritten": "files",
+    "NothingToShow": "analysis.setting",
+    "OtherLens": "imaging.variables",
+    "OtherSettings": "imaging.training",
+    "OutOfRange": "materials.glass",
+    "OutOfReach": "tracing.ray_failures",
+    "OverBudget": "budget",
+    "PictureChanged": "io.pictures",
+    "PictureError": "io.pictures",
+    "ProcessLost": "shards",
+    "RayTableError": "io.ray_tables",
+    "TakesLong": "budget",
+    "TooCoarse": "wave_optics.hybrid",
+    "TooManyPoints": "psf_models.dft",
+    "Unbuildable": "tracing.geometry",
+    "UnfilledStop": "tracing.launch",
+    "Unfit": "stores",
+    "UnknownGlass": "materials.catalogs",
+    "UnknownNumber": "system.parameter_paths",
+    "UnknownOperand": "optimization.merit",
+    "UnsupportedSurface": "io.source",
+    "Untrusted": "tracing.compiler",
+    "VariedGlass": "optimization.variables",
+    "VirtualImage": "analysis.focus_report",
+    "WindowTooLarge": "imaging.field_kernels",
+}
+
+#: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All
+#: others are names of their packages, `rt.imaging.blur`.
+TOP = (
+    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "view", "glass", "to"),
+    *("trace", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare"),
+    *(
+        "ray_fan",
+        "opd_fan",
+        "distortion",
+        "distortion_grid",
+        "field_curvature",
+        "lateral_colour",
+        "seidel",
+        "incidence",
+    ),
+    *(
+        "chromatic_focal_shift",
+        "longitudinal_aberration",
+        "encircled_energy",
+        "relative_illumination",
+        "rms_over_field",
+    ),
+    *("optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
+    *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
+)
+#: Packages whose public names are typed with them.
+NAMESPACES = (
+    *("system", "io", "materials", "maths", "tracing", "analysis", "psf_models", "optimization", "tolerancing"),
+    *("imaging", "wave_optics"),
+)
+#: Names of older versions that changed, and their names now.
+RENAMED = {"element": "phase_element", "elements": "phase_elements"}
+
+__all__ = [*TOP, *NAMESPACES]
 
 #: One thread imports at a time. A folder imports its modules and a module imports its folder first: two threads that
 #: begin at either end would wait for each other, and Python then hands out modules that are partially initialized.
 _IMPORTING = RLock()
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.import_module("importlib.metadata").version("raytrace")
-    if name not in PUBLIC:
+    if name in NAMESPACES:
+        with _IMPORTING:
+            return importlib.import_module(f"raytrace.{name}")
+    now = RENAMED.get(name, name)
+    if now not in PUBLIC and now not in ERRORS:
         raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
-    place, _, defined = PUBLIC[name].partition(":")
+    if now in PUBLIC and now not in TOP:
+        message = f"rt.{name} is rt.{package_of(now)}.{now}; the short name goes with version 0.3"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+    return public_name(now)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *ERRORS})
+
+
+def public_name(name: str) -> Any:
+    """A public function, class, error or value by its name."""
+    place, _, defined = (PUBLIC.get(name) or ERRORS[name]).partition(":")
     with _IMPORTING:
         value = getattr(importlib.import_module(f"raytrace.{place}"), defined or name)
         if not isinstance(value, FunctionType):
             return value
-        return importlib.import_module("raytrace.public").public(value, name)
+        home = "raytrace" if name in TOP else f"raytrace.{package_of(name)}"
+        return importlib.import_module("raytrace.public").public(value, name, home)
 
 
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+def package_of(name: str) -> str:
+    """The package whose name a public one is, such as imaging."""
+    return PUBLIC[name].partition(":")[0].partition(".")[0]
+
+
+def namespace(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package, by which it has the public names that are defined in it."""
+    names = [name for name in PUBLIC if f"raytrace.{package_of(name)}" == package]
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return public_name(name)
+
+    return find, lambda: names

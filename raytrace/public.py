@@ -48,8 +48,8 @@ _OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=â€¦, aperture=â€
 
 
 @functools.cache
-def public(function: Callable, name: str) -> Callable:
-    """A public function as `raytrace` exports it under a name, with the signature and the text of the function.
+def public(function: Callable, name: str, home: str = "raytrace") -> Callable:
+    """A public function as a package, `home`, exports it under a name, with the signature and the text of the function.
 
     It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
     and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for
@@ -77,7 +77,7 @@ def public(function: Callable, name: str) -> Callable:
                 raise
             raise clear from error
 
-    verb.__module__, verb.__qualname__ = "raytrace", name  # where pickle finds it
+    verb.__module__, verb.__qualname__ = home, name  # where pickle finds it
     return verb
 
 
@@ -176,7 +176,7 @@ def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
         return value
     words = {_KINDS.get(kind) or _MADE.get(kind.__name__) or with_article(kind.__name__) for kind in kinds}
     expected = " or ".join(sorted(words))
-    hint = _OF_HEIGHTS if verb in ("elements", "read_element") and hasattr(value, "__len__") else ""
+    hint = _OF_HEIGHTS if verb in ("phase_elements", "read_element") and hasattr(value, "__len__") else ""
     raise TypeError(f"{verb}: {option(name)} is {named_value(value)}; expected {expected}{hint}")
 
 

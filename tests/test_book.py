@@ -125,7 +125,7 @@ def test_page_of_errors_shows_the_messages(tmp_path, monkeypatch):
     calls = failing(tmp_path)
     assert calls.keys() == rows.keys()
     for name, call in calls.items():
-        kind, words = getattr(rt, name), rows[name].removesuffix("…")
+        kind, words = rt.public_name(name), rows[name].removesuffix("…")
         with warnings.catch_warnings(record=True) as issued:
             warnings.simplefilter("always")
             if issubclass(kind, Warning):
@@ -140,7 +140,7 @@ def test_page_of_errors_shows_the_messages(tmp_path, monkeypatch):
 
 def test_page_of_errors_lists_every_public_class():
     page = (DOCS / "reference" / "errors.md").read_text("utf-8")
-    public = [getattr(rt, name) for name in rt.PUBLIC]
+    public = [rt.public_name(name) for name in rt.PUBLIC]
     for kind in public:
         if isinstance(kind, type) and issubclass(kind, Exception):
             row = f"| `rt.{kind.__name__}` |"
@@ -148,7 +148,7 @@ def test_page_of_errors_lists_every_public_class():
 
 
 def test_errors_have_the_base_classes_of_the_page():
-    for kind in (getattr(rt, name) for name in rt.PUBLIC):
+    for kind in (rt.public_name(name) for name in rt.PUBLIC):
         if isinstance(kind, type) and issubclass(kind, Exception):
             base = UserWarning if issubclass(kind, Warning) else ValueError
             assert issubclass(kind, LookupError if kind is rt.UnknownGlass else base), kind
@@ -174,7 +174,7 @@ def test_expressions_of_coming_from_another_program_run(tmp_path, monkeypatch):
         of = {"lens": rt.read_lens("scan_lens")} if "configuration" in text else {}
         assert eval(text, names | of) is not None or ".save(" in text, text
     assert len(calls) >= 10
-    known = {name for verb in rt.PUBLIC for name in options(getattr(rt, verb))} | {*options(names["lens"].at)}
+    known = {name for verb in rt.PUBLIC for name in options(rt.public_name(verb))} | {*options(names["lens"].at)}
     options_alone = {match[1] for text in code if (match := re.match(r"(\w+)=", text))}
     assert options_alone - {"entrance_pupil_diameter"} <= known
     assert {"vary", "ray_aiming", "geometric", "through_focus", "numbering"} <= options_alone

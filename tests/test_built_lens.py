@@ -169,7 +169,7 @@ def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
                         samples,
                         picture=samples.picture[[k]],
                         distance=samples.distance[[k]],
-                        noise=samples.noise[[k]],
+                        index=samples.index[[k]],
                         field=[samples.field[k]],
                         errors=samples.errors[[k]],
                     ),
@@ -211,7 +211,9 @@ def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pict
     assert len({tuple(row) for row in drawn.tolist()}) == count
     with torch.no_grad():
         for number in range(count):
-            restored = built(samples.picture, samples.distance, noise=samples.noise, errors=drawn[number])
+            restored = built(
+                samples.picture, samples.distance, errors=drawn[number], index=samples.index, seed=samples.seed
+            )
             difference = restored - built.target(samples.picture)
             assert float(difference.abs().mean()) == pytest.approx(float(found[0][number]), rel=1e-5)
             psnr = -10 * torch.log10(difference.square().mean())

@@ -306,7 +306,9 @@ def test_what_does_not_fit_is_refused(triplet):
     one = made(triplet)
     with pytest.raises(ValueError, match=r"points of shape \(2, 1\): expected \(2, 2\) mm"):
         one.image(picture, distances, points=points[:, :1])
-    with pytest.raises(ValueError, match=r"shape \(2, 1, 26, 26\): expected \(2, 3, H, W\).* r, g, b of the sensor"):
+    with pytest.raises(
+        ValueError, match=r"shape \(2, 1, 26, 26\) at 2 object distances: expected \(2, 3, H, W\).* r, g, b"
+    ):
         one.image(picture[:, :1], distances, points=points)
     with pytest.raises(ValueError, match=r"values up to 255: expected 0 to 1"):
         one.image(255 * torch.ones_like(picture), distances, points=points)

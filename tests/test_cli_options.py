@@ -346,9 +346,9 @@ NO_OPTION = {
 #: Functions whose parameters are options of a command, by a parameter of its public function that holds them.
 PARTS = {
     "merit": (merit_of_options, DefaultMerit, Merit.of),
-    "as_built": (rt.AsBuilt,),
+    "as_built": (rt.tolerancing.AsBuilt,),
     "sensor": (rt.Sensor, rt.Sensor.capture, read_depth),
-    "model": (rt.DRT, rt.Paraxial),
+    "model": (rt.psf_models.DRT, rt.psf_models.Paraxial),
     "execution": (Execution,),
 }
 #: Options of the runner of one command.
@@ -370,7 +370,7 @@ def parameters(*functions):
 
 @pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
 def test_options_are_the_parameters_of_the_function(command):
-    keywords, actions = inspect.signature(getattr(rt, command.verb)).parameters, rows(command)
+    keywords, actions = inspect.signature(rt.public_name(command.verb)).parameters, rows(command)
     parts = {name for part, functions in PARTS.items() if part in keywords for name in parameters(*functions)}
     names = {name for name in actions if not name.startswith("plot_")} - OF_ONE_RUN.get(command.name, set())
     assert names - {*RUNNER_OPTIONS} <= {*keywords} | parts
@@ -380,7 +380,7 @@ def test_options_are_the_parameters_of_the_function(command):
 @pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
 def test_defaults_of_options_are_those_of_the_function(command):
     actions = rows(command)
-    for name, parameter in inspect.signature(getattr(rt, command.verb)).parameters.items():
+    for name, parameter in inspect.signature(rt.public_name(command.verb)).parameters.items():
         if name in actions and name not in RUNNER_OPTIONS:
             default, stated = parameter.default, actions[name].default
             if stated is None and default not in (None, inspect.Parameter.empty):  # the function's own
@@ -406,7 +406,7 @@ def literals(annotation):
 @pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
 def test_choices_are_those_of_the_annotation(command):
     actions = rows(command)
-    for name, parameter in inspect.signature(getattr(rt, command.verb)).parameters.items():
+    for name, parameter in inspect.signature(rt.public_name(command.verb)).parameters.items():
         if name in actions and (choices := literals(parameter.annotation)):
             assert (*actions[name].choices,) == choices, name
 

@@ -145,7 +145,7 @@ def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):
     z = torch.tensor([12e3, 40e3], dtype=torch.float64)
     own = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
     tilted = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
-    tilted.use(Gaussian(rays=tilted.parameters.rays + 1e-7))  # no longer mirrored, the same to 1e-6
+    tilted.use(Gaussian(rays=tilted.psf_parameters.rays + 1e-7))  # no longer mirrored, the same to 1e-6
     assert float((own.kernels(z) - tilted.kernels(z)).abs().max().detach()) < 1e-6
 
 

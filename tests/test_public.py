@@ -40,7 +40,7 @@ def test_every_public_name_matches_the_table_after_importing_all_modules():
             importlib.import_module(found.name)
     for name, place in rt.PUBLIC.items():
         module, _, own = place.partition(":")
-        found = getattr(rt, name)
+        found = rt.public_name(name)
         defined = getattr(importlib.import_module(f"raytrace.{module}"), own or name)
         assert (found.__wrapped__ if inspect.isfunction(found) else found) is defined, name
         assert not isinstance(found, type(sys)), name
@@ -352,9 +352,9 @@ def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatc
     words = [word for name, given in needed.items() for word in (f"--{name}", str(given))]
     assert main([command.name, "cooke_triplet", "--json", *words]) == 0
     printed = capsys.readouterr().out
-    found = getattr(rt, command.verb)(rt.read_lens("cooke_triplet"), **needed)
+    found = rt.public_name(command.verb)(rt.read_lens("cooke_triplet"), **needed)
     assert_alike(json.loads(printed), found.document())
-    verb = getattr(rt, command.verb)
+    verb = rt.public_name(command.verb)
     monkeypatch.setattr(rt, command.verb, functools.wraps(verb)(lambda *_, **options: found))
     assert main([command.name, "cooke_triplet", *words]) == 0
     assert capsys.readouterr().out == f"{found}\n"
@@ -526,7 +526,7 @@ def test_an_analysis_takes_plain_numbers_and_tabulates_prints_and_draws_itself(
 ):
     """As JSON by the function itself; as text and figure the result already computed."""
     lens = rt.read_lens("cooke_triplet")
-    found = getattr(rt, verb)(lens, **keywords)
+    found = rt.public_name(verb)(lens, **keywords)
     frame = found.to_frame()
     assert frame[column].notna().any()
     assert len(frame) == len(found.document()["results"])
@@ -535,7 +535,7 @@ def test_an_analysis_takes_plain_numbers_and_tabulates_prints_and_draws_itself(
     command = [verb.replace("_", "-"), "cooke_triplet", *words.split()]
     assert main([*command, "--json"]) == 0
     assert_alike(json.loads(capsys.readouterr().out), found.document())
-    function = getattr(rt, verb)
+    function = rt.public_name(verb)
     monkeypatch.setattr(rt, verb, functools.wraps(function)(lambda *_, **options: found))
     assert main([*command, "--plot", str(tmp_path / "command.png")]) == 0
     assert capsys.readouterr().out == f"{found}\n"

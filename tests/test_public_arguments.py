@@ -17,7 +17,7 @@ from raytrace.tracing.spot import spot_of
 from raytrace.tracing.trace import trace_lens
 
 NAN = float("nan")
-FUNCTIONS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
+FUNCTIONS = {name: each for name in rt.PUBLIC if inspect.isfunction(each := rt.public_name(name))}
 PARAMETERS = {name: inspect.signature(function).parameters for name, function in FUNCTIONS.items()}
 OF_A_LENS = [name for name, parameters in PARAMETERS.items() if "lens" in parameters]
 OF_SEVERAL = [(function, name) for function, names in PARAMETERS.items() for name in names if name in public._SEVERAL]
@@ -204,7 +204,7 @@ def test_one_number_serves_as_a_wavelength(path):
 
 def test_the_verbs_are_those_of_the_modules():
     for name, function in FUNCTIONS.items():
-        assert function is getattr(rt, name)
+        assert function is rt.public_name(name)
         assert function.__doc__ == function.__wrapped__.__doc__
         assert pickle.loads(pickle.dumps(function)) is function
 

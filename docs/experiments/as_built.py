@@ -46,7 +46,7 @@ def start_of(name: str, f_number: float, field: float):
     length = float(rt.first_order(lens).effective_focal_length)
     track = float(sum(surface.thickness for surface in lens.surfaces[1:-1]))
     lens = lens.at(f_number=f_number, fields=[0, 0.7 * field, field])
-    merit = rt.DefaultMerit("spot", glass_thickness=(2, 20), air_thickness=(0.3, 30), edge=1)
+    merit = rt.optimization.DefaultMerit("spot", glass_thickness=(2, 20), air_thickness=(0.3, 30), edge=1)
     hold = f"efl={length} total_track<={1.05 * track}"
     return lens, {"merit": merit, "vary": "curvature thickness", "hold": hold}
 
@@ -69,7 +69,7 @@ def desensitised(
     lens, settings = start_of(name, f_number, field)
     first = rt.optimize(lens, cycles=900, **settings)
     ends = {"usual": rt.optimize(first.lens, cycles=cycles, **settings)}
-    as_built = rt.AsBuilt(GRADE, rings=rings, weight=weight)
+    as_built = rt.tolerancing.AsBuilt(GRADE, rings=rings, weight=weight)
     ends["robust"] = rt.optimize(first.lens, cycles=cycles, as_built=as_built, **settings)
     return {key: numbers_of(end.lens) for key, end in ends.items()}
 
@@ -85,7 +85,7 @@ def sensitivity(lens) -> dict[str, np.ndarray]:
     waves = rt.tolerance(lens, grade=GRADE, criterion="wavefront", trials=300, seed=SEED)
     spots = rt.tolerance(lens, grade=GRADE, trials=0)
     changes = torch.maximum(spots.minimum, spots.maximum)
-    expected = 1e3 * rt.AsBuilt(GRADE).of(lens).expected(lens).sqrt()
+    expected = 1e3 * rt.tolerancing.AsBuilt(GRADE).of(lens).expected(lens).sqrt()
     of_waves = {"nominal": waves.nominal.numpy(), "waves": waves.trials.numpy()}
     return {**of_waves, "changes": changes.numpy(), "expected": expected.detach().numpy()}
 
@@ -105,7 +105,7 @@ def samples(term: AsBuiltTerm) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         part, each = torch.eye(count, dtype=torch.float64) * step, 0.5 * variance / step**2
         return torch.cat([mean[None], mean + part, mean - part]), torch.cat([1 - 2 * each.sum()[None], each, each])
 
-    drawn = rt.draw_errors(term.tolerances, len(errors), seed=7)
+    drawn = rt.tolerancing.draw_errors(term.tolerances, len(errors), seed=7)
     found = {"two levels, L = " + str(len(errors)): alike(errors), "two levels and their negatives": None}
     found["two levels and their negatives"] = alike(torch.cat([errors, 2 * mean - errors]))
     found["second order, differences of 0.05 half widths"] = differences(0.05 * half)
@@ -133,8 +133,8 @@ def expectation(lens, term: AsBuiltTerm, errors: torch.Tensor, weights: torch.Te
 
 def table_of_samples(store: Store, name: str, reference: int = 6000) -> list[str]:
     lens = rt.read_lens(name)
-    term = rt.AsBuilt(GRADE).of(lens)
-    drawn = rt.draw_errors(term.tolerances, reference, seed=5)
+    term = rt.tolerancing.AsBuilt(GRADE).of(lens)
+    drawn = rt.tolerancing.draw_errors(term.tolerances, reference, seed=5)
     pairs = torch.cat([drawn, -drawn])
     cases = samples(term) | {"reference": (pairs, torch.full((len(pairs),), 1 / len(pairs), dtype=torch.float64))}
     cases["nominal"] = torch.zeros_like(drawn[:1]), torch.ones(1, dtype=torch.float64)

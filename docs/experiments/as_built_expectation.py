@@ -31,7 +31,7 @@ def seconds_of_expectation(lens: rt.Lens, grade: str, criterion: str) -> float:
         rt.tolerances(lens, grade=grade),
         study.views_of(lens, partial(criterion_of, criterion), None, None, None),
     )
-    drawn = rt.draw_errors(rows, 2**15, seed=1)
+    drawn = rt.tolerancing.draw_errors(rows, 2**15, seed=1)
     mean, variance = (drawn.new_tensor(part) for part in zip(*map(study.moments, rows), strict=True))
     for _ in range(3):  # the first compiles, and fills tables
         start = time.process_time()
@@ -42,7 +42,7 @@ def seconds_of_expectation(lens: rt.Lens, grade: str, criterion: str) -> float:
     return seconds
 
 
-def timed(**options) -> tuple[rt.Toleranced, float]:
+def timed(**options) -> tuple[rt.tolerancing.Toleranced, float]:
     """A study and its processor time in s."""
     start = time.process_time()
     found = rt.tolerance(**options)

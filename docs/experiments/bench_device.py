@@ -15,7 +15,7 @@ from raytrace.bench.measure import in_turns, variables, with_leaves
 
 def psf_step(model, lens, rays=None, size=65):
     """Gradient of the energy in the central pixel with respect to all curvatures and thicknesses."""
-    chosen = model if rays is None else rt.DRT(rays=rays)
+    chosen = model if rays is None else rt.psf_models.DRT(rays=rays)
     lens, leaves = with_leaves(lens, variables(lens))
 
     def step():
@@ -28,7 +28,7 @@ def psf_step(model, lens, rays=None, size=65):
 def training_step(device, dtype=torch.float32):
     torch.manual_seed(0)
     lens = rt.to(rt.read_lens("double_gauss"), device=device)
-    camera = rt.Camera(rt.Variables(lens, "curvature sensor"), rt.RedNet(), model="gaussian").to(device)
+    camera = rt.Camera(rt.Variables(lens, "curvature sensor"), rt.imaging.RedNet(), model="gaussian").to(device)
     images = torch.rand(8, 256, 256, dtype=dtype, generator=torch.Generator().manual_seed(1)).to(device)
     distances = torch.linspace(20e3, 40e3, 8, dtype=torch.float64, device=device)
 

@@ -133,7 +133,7 @@ def restored(kernels: Tensor, spectrum: Tensor, sigma: Tensor, electrons: Tensor
             image = blur(patches, kernel, boundary="reflect")
             image = count_electrons(image.clamp_min(0), float(n), generator=generator)
             image = add_noise(image, READ_NOISE / float(n), generator=generator)
-            estimate = rt.restore(image, filter)
+            estimate = rt.imaging.restore(image, filter)
             found.append(float(mean_square_error(estimate, patches, margin=SIZE // 2).mean()))
     return float(np.mean(found))
 
@@ -291,7 +291,7 @@ def main(words: list[str] | None = None) -> None:
     chosen = parser.parse_args(words)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnfilledStop)
-    rt.prepare()
+    rt.tracing.prepare()
     sets = split(read(files(chosen.data, chosen.limit), least=PATCH))
     pictures = tuple([linearised(sample).double() for sample in part.samples] for part in sets)
     chosen.folder.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
 
 def parts(lens: rt.Lens, repeats: int) -> dict[str, float]:
     """ms of each step."""
-    pupil = rt.gauss_rings(2, 7)
+    pupil = rt.maths.gauss_rings(2, 7)
     model = design_variables(lens, VARY)
     bundle = Bundle(model.views[0], len(lens.surfaces) - 1)
     for wavelength in range(len(lens.wavelengths)):
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> None:
     options(parser)
     repeats = parser.parse_args(argv).repeats
     torch.set_num_threads(1)
-    rt.prepare()
+    rt.tracing.prepare()
     lens = rt.read_lens("double_gauss").at(ray_aiming="off")
     aimed = lens.at(ray_aiming="real")
     columns = [parts(lens, repeats), parts(aimed, repeats)]

@@ -25,3 +25,7 @@ To add an analysis: a file with a function, whose docstring has an entry for eac
 `cli/commands.py`. The text, CSV, JSON and the options of the command follow from those. Tests: `test_analysis` (all of
 them), `test_plot_analysis` (figures), `test_result` (units) and `test_NAME` (each by itself).
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

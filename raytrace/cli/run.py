@@ -74,7 +74,7 @@ def _run_of(arguments: argparse.Namespace) -> Run:
     if command.run:
         module, _, name = command.run.partition(":")
         return getattr(importlib.import_module(f"raytrace.{module}"), name)
-    return partial(result_of_lens, verb=getattr(raytrace, command.verb))
+    return partial(result_of_lens, verb=raytrace.public_name(command.verb))
 
 
 def _run_each(run: Run, arguments: argparse.Namespace, distances: list[float]) -> int:
@@ -115,7 +115,7 @@ def _run_each(run: Run, arguments: argparse.Namespace, distances: list[float]) -
 def _takes(arguments: argparse.Namespace, keyword: str) -> bool:
     """Whether the command calls a public function with this parameter; codesign and bench call none."""
     verb = arguments.run.verb
-    parameters = inspect.signature(getattr(raytrace, verb)).parameters if verb in raytrace.PUBLIC else ()
+    parameters = inspect.signature(raytrace.public_name(verb)).parameters if verb in raytrace.PUBLIC else ()
     return keyword in parameters or ("execution" in parameters and keyword in _EXECUTION)
 
 

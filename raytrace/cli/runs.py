@@ -123,7 +123,7 @@ def view(arguments: argparse.Namespace) -> None:
 def wave_psf(arguments: argparse.Namespace) -> Result:
     """PSFs of an element, and figures of the element."""
     options = options_of(arguments) | {"catalog": catalogs(arguments)}
-    psf = raytrace.wave_psf(**options)
+    psf = raytrace.wave_optics.wave_psf(**options)
     for content in ("heights", "caustic", "encircled"):
         if path := vars(arguments).pop(f"plot_{content}"):
             with printed_on_failure(psf, arguments):

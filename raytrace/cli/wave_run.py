@@ -31,7 +31,7 @@ from raytrace.io.pictures import read_channels, write_picture
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.settings import DesignSettings
 from raytrace.tracing.compiled import prepare
-from raytrace.wave_optics.compute import elements
+from raytrace.wave_optics.compute import phase_elements
 from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.element_files import write_element
 from raytrace.wave_optics.fabrication import as_pixels, fabricated
@@ -220,7 +220,7 @@ def restore_files(arguments: argparse.Namespace) -> RestoredImages:
     config = _config(arguments)
     names = ("aperture", "sensor", "focus", "design_wavelength", "levels", "exact", "glass", "index", "pitch", "span")
     options = {name: value for name, value in vars(arguments).items() if name in names}
-    parts = elements(arguments.element, wavelengths=config.wavelengths, catalog=catalogs(arguments), **options)
+    parts = phase_elements(arguments.element, wavelengths=config.wavelengths, catalog=catalogs(arguments), **options)
     folder, records = Path(arguments.folder), []
     folder.mkdir(parents=True, exist_ok=True)
     for file in arguments.images:

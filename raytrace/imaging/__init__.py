@@ -23,7 +23,10 @@ Tests: tests/test_MODULE.py; test_imaging_variables (thickness limits), test_wav
 test_wave_design_cli (phase elements).
 """
 
+from raytrace import namespace
 from raytrace.imaging.camera import Camera as Camera
 from raytrace.imaging.network import RedNet as RedNet
 from raytrace.imaging.variables import PhaseVariables as PhaseVariables
 from raytrace.imaging.variables import Variables as Variables
+
+__getattr__, __dir__ = namespace(__name__)

@@ -178,7 +178,7 @@ class Camera(nn.Module):
                 raise ValueError(f"{name} {word!r}: expected {' or '.join(known)}")
         if isinstance(self.size, bool) or not isinstance(self.size, int) or self.size < 1 or self.size % 2 == 0:
             raise ValueError(f"pixels {self.size!r}: expected an odd number of pixels of the sensor")
-        if self.center == "centroid" and has_points(self.parameters):
+        if self.center == "centroid" and has_points(self.psf_parameters):
             raise ValueError("windows of the rays of pupil points are about the chief ray: give center chief")
         if self.elements() and (self.center, self.normalise) != ("chief", "window"):
             raise ValueError(
@@ -194,7 +194,7 @@ class Camera(nn.Module):
         sensor_compensator(self.variables.lens, self.tolerances)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        self.fields, self.points, self.parameters = converted((self.fields, self.points, self.parameters), fn)
+        self.fields, self.points, self.psf_parameters = converted((self.fields, self.points, self.psf_parameters), fn)
         self._memo = Memo(object_distances=self.range)  # its rays are of the former dtype and device
         return super()._apply(fn, recurse)
 
@@ -258,10 +258,10 @@ class Camera(nn.Module):
     def use(self, model: str | Paraxial | Fourier | Gaussian | DRT | Wave) -> None:
         """Simulate with another PSF model, by its name or with its numbers."""
         if isinstance(model, str):
-            self.model, self.parameters = model, None if model not in MODELS else model_of(model)
+            self.model, self.psf_parameters = model, None if model not in MODELS else model_of(model)
         else:
-            self.model, self.parameters = name_of(model), model
-        self._order = getattr(self.parameters, "order", None)
+            self.model, self.psf_parameters = name_of(model), model
+        self._order = getattr(self.psf_parameters, "order", None)
         self._check()
 
     def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
@@ -278,7 +278,7 @@ class Camera(nn.Module):
         lens = self.lens()
         if self.tolerances is not None:
             lens = self.as_built(draw_errors(self.tolerances, len(distances)))
-        how = {"elements": self.elements(), "center": self.center, "parameters": self.parameters}
+        how = {"elements": self.elements(), "center": self.center, "parameters": self.psf_parameters}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
@@ -315,7 +315,7 @@ class Camera(nn.Module):
             distances,
             self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances),
             elements=self.elements(),
-            parameters=self.parameters,
+            parameters=self.psf_parameters,
             center=self.center,
             normalise=self.normalise,
             memo=self._memo if points is None and errors is None else None,

@@ -168,7 +168,7 @@ class Sensor:
         lens = as_lens(lens, "Sensor.fields")
         points = _components(points, "points").to(lens.surfaces[-2].thickness)
         known = torch.isfinite(points.detach()).all(0)
-        lens, points = aligned(lens, points.dim() - 1), torch.where(known, points, 0.0)
+        lens, points = aligned(lens, points.dim() - 1, exactly=True), torch.where(known, points, 0.0)
         paraxial = first_order(lens)
         extent, found = object_field(with_field_kind(lens, "real_image_height"), points, paraxial)
         of_image = lens.fields.kind == "real_image_height"
@@ -188,7 +188,7 @@ class Sensor:
             wavelength = lens.primary
         else:
             wavelength, fields, known = wavelengths_of(lens, wavelengths), fields[..., None], known[..., None]
-        lens = aligned(lens, fields.dim() - 1)
+        lens = aligned(lens, fields.dim() - 1, exactly=True)
         rays = rays_of_field(lens, fields, torch.zeros_like(fields), wavelength=wavelength)
         (points,), arrives = points_at(lens, wavelength, (len(lens.surfaces) - 1,))(rays)
         return torch.where(arrives & known, points, torch.nan)

@@ -28,6 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from raytrace import namespace
 from raytrace.files import shipped, write_atomically
 from raytrace.io import oslo, ray_optics
 from raytrace.io.assembly import TILTED_OBJECT, changes
@@ -332,3 +333,6 @@ def _checked(form: Format, lens: Lens, path: Path, catalogs: Sequence[str | Path
         message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
         warnings.warn(message, LensFileWarning, stacklevel=calling_level())
     return content
+
+
+__getattr__, __dir__ = namespace(__name__)

@@ -12,3 +12,7 @@ a line of `glass_catalogs/ALIASES.csv`.
 
 Tests: `tests/test_glass.py`, `tests/test_glass_table.py`, `tests/test_catalogs.py`, `tests/test_environment.py`.
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

@@ -15,3 +15,7 @@ To add a sampling: a function of one size that returns points (2, P) and weights
 Tests: tests/test_numerics, test_dual, test_value (numerics), test_tangents, test_pupil (sampling), test_zernike,
 test_result.
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

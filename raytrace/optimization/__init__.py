@@ -20,3 +20,7 @@ compares it with the analysis of the same quantity (`tests/test_operands_FAMILY.
 `system.parameter_paths` lists can vary. Tests of variables and constraints: `tests/test_variable_syntax.py`,
 `test_constraints.py`; of the descent: `test_optimize.py`, `test_attained.py`, `test_checkpoint.py`; `test_search.py`.
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

@@ -23,6 +23,7 @@ Tests: tests/test_psf_MODULE.py; test_psf (the call), test_psf_laws (all models)
 test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_shards (processes), test_plot_psf.
 """
 
+from raytrace import namespace
 from raytrace.psf_models.figures import CloseUp as CloseUp
 from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import DRT as DRT
@@ -40,3 +41,5 @@ from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels
 from raytrace.psf_models.result import Psf as Psf
 from raytrace.tracing.scene import Memo as Memo
+
+__getattr__, __dir__ = namespace(__name__)

@@ -28,3 +28,7 @@ To add:
 Tests: tests/test_MODULE.py; test_shapes adds a kind of each to the tables; test_asphere and test_freeform (sags),
 test_compiled_sags and test_compiled_poses (against the compiled trace), test_hardcases (extreme numbers).
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

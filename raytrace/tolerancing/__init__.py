@@ -16,3 +16,7 @@ jacobian        `jacobian`: derivatives of any quantity by design variables and 
 
 A kind of error is a row of `KINDS` in `system/tolerance_data.py`.
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

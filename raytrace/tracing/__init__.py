@@ -28,3 +28,7 @@ Tests: tests/test_MODULE.py; test_compiled, test_compiled_sags, test_compiled_po
 and test_cone_angle (launch), test_wavefront_map, test_opticstudio (frozen listings of OpticStudio),
 test_no_sync (no host synchronisation), test_scale (Jacobians).
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

@@ -24,3 +24,7 @@ To add:
 Tests: tests/test_wave_MODULE.py; test_wave_psf (compute), test_wave_plan_errors (predicted errors),
 test_wave_propagation and test_wave_radial (engines).
 """
+
+from raytrace import namespace
+
+__getattr__, __dir__ = namespace(__name__)

@@ -267,7 +267,7 @@ def wave_psf(
         design = {"aperture": aperture, "sensor": sensor, "focus": focus, "exact": exact}
         material = {"glass": glass, "index": index, "pitch": pitch, "span": span, "catalog": catalog}
         wrap = {"design_wavelength": design_wavelength, "levels": levels, "wavelengths": wavelengths}
-        parts, name = elements(element, **design, **material, **wrap), str(element)
+        parts, name = phase_elements(element, **design, **material, **wrap), str(element)
     else:
         parts = in_contact(element)
         own = 2 * float(parts[0].radius.detach()) if parts else 0.0
@@ -296,7 +296,7 @@ def wave_psf(
     return ElementPsf(kernel, scene, chosen, name, axial[0][..., 0, 0] if axial else None)
 
 
-def elements(
+def phase_elements(
     element: str | os.PathLike = "singlet",
     *,
     aperture: float = 5.0,

@@ -149,7 +149,7 @@ class Element:
 PROFILES = {"pixels": (Pixels, 2), "rings": (Rings, 1), "zernike": (Zernike, 1), "powers": (EvenPowers, 1)}
 
 
-def element(
+def phase_element(
     numbers: Tensor | Sequence[float],
     *,
     aperture: float,
