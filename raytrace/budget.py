@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, with_options
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -48,15 +48,16 @@ def within(max_bytes: float | None) -> Iterator[None]:
 def afford(needed: float, what: str, *, helps: str) -> None:
     """Raise OverBudget if `needed` bytes exceed the limit.
 
-    what: the cause and its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy.
+    what: the cause and its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy, its options in
+    braces (`words.with_options`).
     """
     if needed <= _SMALL:
         return
     limit = allowed_bytes()
     if needed > limit:
         raise OverBudget(
-            f"{what} ({in_words(needed)}; {in_words(limit)} may be taken): {helps}, or allow more by --max-bytes "
-            "(raytrace.budget.within)"
+            f"{what} ({in_words(needed)}; {in_words(limit)} may be taken): {with_options(helps)}, or allow more by "
+            "--max-bytes (raytrace.budget.within)"
         )
 
 
@@ -68,7 +69,7 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     afford(
         RAY_BYTES * rays,
         what,
-        helps=f"ask for fewer {option('fields')}, {option('wavelengths')} or points of the pupil",
+        helps="ask for fewer {fields}, {wavelengths} or points of the pupil",
     )
 
 
@@ -76,7 +77,7 @@ def forewarn(seconds: float, what: str, *, helps: str) -> None:
     """Warn TakesLong of a long predicted time, right to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:
         length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
-        warnings.warn(f"{what}: about {length}; for less, {helps}", TakesLong, stacklevel=calling_level())
+        warnings.warn(f"{what}: about {length}; for less, {with_options(helps)}", TakesLong, stacklevel=calling_level())
 
 
 def allowed_bytes() -> float:

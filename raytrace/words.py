@@ -97,6 +97,17 @@ def option(name: str, value: object = "") -> str:
     return f"{flag} {text}" if text else flag
 
 
+class _Options(dict[str, str]):
+    def __missing__(self, key: str) -> str:
+        name, _, value = key.partition("=")
+        return option(name, value)
+
+
+def with_options(text: str) -> str:
+    """A text whose {fields} or {model=drt} are options, named as by `option`."""
+    return text.format_map(_Options())
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """What may have been meant by a word, of the known ones, as the end of a message; empty if nothing is near."""
     spelled = {name.lower(): name for name in known}

@@ -34,7 +34,7 @@ from raytrace.psf_models import MODELS, Execution
 from raytrace.tolerancing.grades import GRADES
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
 from raytrace.tracing.spot import arrivals
-from raytrace.words import did_you_mean, in_command, option
+from raytrace.words import did_you_mean, in_command, option, with_options
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
@@ -89,7 +89,7 @@ def test_data_pixels_and_figures_have_their_own_options(name):
         wrong, said = ("x.pdf", "ends in .png") if name == "render" else ("x.png", "is a picture: figures are saved by")
         with pytest.raises(argparse.ArgumentTypeError, match=said):
             known["-o"].type(wrong)
-    if "--size" in known:
+    if "--size" in known and known["--size"].help != argparse.SUPPRESS:
         assert known["--size"].help.startswith("pixels across")
     if "--plot" in known:
         assert known["--plot"].type is picture_file
@@ -463,6 +463,7 @@ def test_an_option_is_named_as_its_reader_writes_it():
         assert option("ray_aiming", "real") == "--ray-aiming real"
         assert option("fields") == "--field"
         assert option("tol", 0.1) == "`tol=0.1`"  # not an option of that command
+        assert with_options("fewer {fields}, {ray_aiming=off}") == "fewer --field, --ray-aiming off"
     assert option("fields") == "`fields`"
 
 

@@ -68,7 +68,7 @@ def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: i
         raise NothingToShow(
             f"nothing to show over wavelength: the lens has a single one; give a range by {option('wavelengths')}"
         )
-    afford(RAY_BYTES * samples, f"{samples:,} wavelengths", helps=f"ask for fewer {option('samples')}")
+    afford(RAY_BYTES * samples, f"{samples:,} wavelengths", helps="ask for fewer {samples}")
     places = low + (high - low) * torch.linspace(0.0, 1.0, samples, **like(lens))
     check_media(lens, places)
     primary = primary_wavelength(lens)

@@ -111,7 +111,7 @@ def _rays(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     afford(
         64 * F * W * _RAYS,
         f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)",
-        helps=f"ask for fewer {option('fields')}",
+        helps="ask for fewer {fields}",
     )
     parts = [_rays_of(lens, some) for some in fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
     distance, energy, centroid = zip(*parts, strict=True)

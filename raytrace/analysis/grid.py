@@ -21,7 +21,6 @@ from raytrace.plotting.style import GREY, array, field_colour, new_figure, numbe
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
 from raytrace.tracing.spot import chief_points
-from raytrace.words import option
 
 _NEAR_AXIS = 1e-4  # of the largest field: its rays give the scale of the image; they leave 1e-8 of the distortion
 
@@ -119,7 +118,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     afford(
         RAY_BYTES * rays,
         f"{rays:,} chief rays of {points:,} × {points:,} objects",
-        helps=f"ask for fewer {option('points')}",
+        helps="ask for fewer {points}",
     )
     described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)

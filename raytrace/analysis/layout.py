@@ -135,9 +135,7 @@ def layout(
     points = field_points(fields, like=lens)
     count = rays * points.shape[1] * (1 if chosen is None else len(chosen))
     surfaces = len(lens.surfaces)
-    afford(
-        RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps=f"ask for fewer {option('rays')}"
-    )
+    afford(RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps="ask for fewer {rays}")
     warn_of_filling(lens, points)
     return Layout(lens, points, rays, view, chosen, every, fields is not None)
 

@@ -14,7 +14,6 @@ from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import need_axis
-from raytrace.words import option
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that replaces the central one leaves 1e-8 of the spherical aberration
 
@@ -61,7 +60,7 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
     rays = points * len(lens.wavelengths)
-    afford(RAY_BYTES * rays, f"{rays:,} rays", helps=f"ask for fewer {option('points')}")
+    afford(RAY_BYTES * rays, f"{rays:,} rays", helps="ask for fewer {points}")
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
     on_axis = torch.stack([torch.zeros_like(heights), heights])

@@ -80,7 +80,7 @@ def like(lens: Lens) -> dict:
 
 def field_range(lens: Lens, size: int) -> Tensor:
     """Fields (2, size) along y from the axis to the lens's largest. Raises OverBudget for too many to be traced."""
-    afford(RAY_BYTES * size * len(lens.wavelengths), f"{size:,} fields", helps=f"ask for fewer {option('samples')}")
+    afford(RAY_BYTES * size * len(lens.wavelengths), f"{size:,} fields", helps="ask for fewer {samples}")
     return largest_field(lens) * torch.linspace(0.0, 1.0, size, **like(lens))
 
 

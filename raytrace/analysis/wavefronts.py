@@ -22,7 +22,7 @@ from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene, symmetry
 from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
-from raytrace.words import calling_level, option
+from raytrace.words import calling_level
 
 _RINGS = 14, 56
 _GRID = 127
@@ -146,7 +146,7 @@ def wavefront(
     afford(
         _MAP_BYTES * F * W * size * size,
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
-        helps=f"ask for a smaller {option('size')}, or fewer fields or wavelengths",
+        helps="ask for a smaller {size}, or fewer fields or wavelengths",
     )
     zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}

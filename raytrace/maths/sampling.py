@@ -28,7 +28,7 @@ def _at_least_one(rule: str, **sizes: float) -> None:
 
 def _afford(count: float, what: str, size: str) -> None:
     """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
-    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer {option(size)}")
+    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer {{{size}}}")
 
 
 def gauss_rings(

@@ -18,7 +18,7 @@ from raytrace.maths.sampling import Grid, centres, gauss_rings
 from raytrace.maths.tangents import applied
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 
 class TooManyPoints(RaytraceError, ValueError):
@@ -268,9 +268,7 @@ def _bessel_slope(x: Tensor, number: int) -> Tensor:
     return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
 
 
-def _helps() -> str:
-    fewer = f"a larger {option('tol')}, a smaller {option('size')} or {option('pixel')}"
-    return f"give {fewer}, a slower aperture ({option('f_number')}), {option('model', 'drt')}"
+_HELPS = "give a larger {tol}, a smaller {size} or {pixel}, a slower aperture ({f_number}), {model=drt}"
 
 
 def _speed(scene: Scene) -> str:
@@ -282,7 +280,7 @@ def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
     turns = phase / (2 * math.pi)
     need = f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times"
     # A matrix n × n: the points that the rings serve grow alike.
-    afford(24.0 * rings**2 + 128.0 * rings * math.prod(scene.shape), need, helps=_helps())
+    afford(24.0 * rings**2 + 128.0 * rings * math.prod(scene.shape), need, helps=_HELPS)
 
 
 def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
@@ -290,4 +288,4 @@ def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
     D, _, W = scene.shape
     rows, columns = grid.rows * nodes, grid.columns * nodes
     need = f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels"
-    afford(64.0 * D * W * rows * columns, need, helps=_helps())
+    afford(64.0 * D * W * rows * columns, need, helps=_HELPS)

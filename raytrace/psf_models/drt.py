@@ -34,7 +34,6 @@ from raytrace.system.apertures import Aperture, clearance
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing import streaming
 from raytrace.tracing.scene import Scene, beam_share, symmetry, trace_apertures, trace_scene
-from raytrace.words import option
 
 _RAY_WIDTH = 0.25  # half width in pixels of an independent ray, for a derivative
 
@@ -351,10 +350,7 @@ def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float
     """Raise OverBudget if (D, F, W) kernels of across × along pupil cells, `each` bytes, exceed the memory budget."""
     count = math.prod(kernels)
     need = f"the ray-traced PSF needs {across:,} × {along:,} pupil cells for each of {count} kernels"
-    helps = (
-        f"give a larger {option('pixel')}, fewer fields or wavelengths at once, {option('rays')}, "
-        f"{option('model', 'gaussian')}"
-    )
+    helps = "give a larger {pixel}, fewer fields or wavelengths at once, {rays}, {model=gaussian}"
     afford(each * count * across * along, f"{need}: the blur spans many pixels", helps=helps)
 
 

@@ -338,7 +338,7 @@ def psf(
     afford(
         _PIXEL_BYTES * D * F * W * rows * columns,
         f"{D * F * W:,} PSFs of {rows:,} × {columns:,} pixels",
-        helps=f"ask for a smaller {option('size')}, or fewer {option('fields')} at once",
+        helps="ask for a smaller {size}, or fewer {fields} at once",
     )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)

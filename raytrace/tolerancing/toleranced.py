@@ -446,9 +446,7 @@ def tolerance(
         raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if not len(tolerances):
         raise BadTolerance(f"no tolerances; give rows, a {option('grade')} or {option('limits')}")
-    afford(
-        8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps=f"ask for fewer {option('trials')}"
-    )
+    afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer {trials}")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= light_loss <= 1:

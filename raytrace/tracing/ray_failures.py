@@ -147,7 +147,7 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
     primary = lens.primary[None]
     F, P = tried.shape[1], pupil.shape[1]
-    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps=f"ask for fewer {option('fields')}")
+    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer {fields}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of aiming: the failures are reported below
         rays = launch(lens, pupil, fields=tried, wavelengths=primary)

@@ -356,7 +356,7 @@ def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: 
     """
     D, W = len(scene.depths), len(scene.wavelengths)
     whole = chosen.memory < min(_CHUNK, allowed_bytes())
-    helps = f"take fewer by {option('samples')} or a larger {option('tol')}, a smaller window by {option('size')}"
+    helps = "take fewer by {samples} or a larger {tol}, a smaller window by {size}"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)
