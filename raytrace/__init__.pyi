@@ -78,6 +78,7 @@ from raytrace.materials.glass import OutOfRange as OutOfRange
 from raytrace.materials.properties import glass as glass
 from raytrace.maths.arrays import ArrayError as ArrayError
 from raytrace.maths.numerics import to as to
+from raytrace.optimization.attained import NotReached as NotReached
 from raytrace.optimization.checkpoint import BadCheckpoint as BadCheckpoint
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
@@ -88,7 +89,6 @@ from raytrace.optimization.merit import Circle as Circle
 from raytrace.optimization.merit import Merit as Merit
 from raytrace.optimization.merit import UnknownOperand as UnknownOperand
 from raytrace.optimization.operands.operand import BadRow as BadRow
-from raytrace.optimization.optimize import NotReached as NotReached
 from raytrace.optimization.optimize import optimize as optimize
 from raytrace.optimization.problem import NoLight as NoLight
 from raytrace.optimization.problem import NoProblem as NoProblem
@@ -112,11 +112,11 @@ from raytrace.system.parameter_paths import BadVariables as BadVariables
 from raytrace.system.parameter_paths import UnknownNumber as UnknownNumber
 from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
+from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.jacobian import NoDerivatives as NoDerivatives
 from raytrace.tolerancing.jacobian import jacobian as jacobian
-from raytrace.tolerancing.toleranced import tolerance as tolerance
-from raytrace.tolerancing.tolerances import BadTolerance as BadTolerance
+from raytrace.tolerancing.table import BadTolerance as BadTolerance
 from raytrace.tracing.compiler import NoCompiler as NoCompiler
 from raytrace.tracing.compiler import Untrusted as Untrusted
 from raytrace.tracing.focus import NoImage as NoImage

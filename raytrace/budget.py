@@ -45,18 +45,18 @@ def within(max_bytes: float | None) -> Iterator[None]:
         _limit.reset(token)
 
 
-def afford(needed: float, what: str, *, helps: str) -> None:
+def afford(needed: float, cause: str, *, helps: str) -> None:
     """Raise OverBudget if `needed` bytes exceed the limit.
 
-    what: the cause and its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy, its options in
-    braces (`words.with_options`).
+    cause: with its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy, its options in braces
+    (`words.with_options`).
     """
     if needed <= _SMALL:
         return
     limit = allowed_bytes()
     if needed > limit:
         raise OverBudget(
-            f"{what} ({in_words(needed)}; {in_words(limit)} may be taken): {with_options(helps)}, or allow more by "
+            f"{cause} ({in_words(needed)}; {in_words(limit)} may be taken): {with_options(helps)}, or allow more by "
             "--max-bytes (raytrace.budget.within)"
         )
 
@@ -65,19 +65,17 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     """Raise OverBudget for more rays than memory holds; counts: of fields, wavelengths, …, by name."""
     rays = math.prod((pupil_points, *counts.values()))
     factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
-    what = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
-    afford(
-        RAY_BYTES * rays,
-        what,
-        helps="ask for fewer {fields}, {wavelengths} or points of the pupil",
-    )
+    cause = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
+    afford(RAY_BYTES * rays, cause, helps="ask for fewer {fields}, {wavelengths} or points of the pupil")
 
 
-def forewarn(seconds: float, what: str, *, helps: str) -> None:
-    """Warn TakesLong of a long predicted time, right to a factor of three; arguments as for `afford`."""
+def forewarn(seconds: float, cause: str, *, helps: str) -> None:
+    """Warn TakesLong of a long predicted time, accurate to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:
         length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
-        warnings.warn(f"{what}: about {length}; for less, {with_options(helps)}", TakesLong, stacklevel=calling_level())
+        warnings.warn(
+            f"{cause}: about {length}; for less, {with_options(helps)}", TakesLong, stacklevel=calling_level()
+        )
 
 
 def allowed_bytes() -> float:

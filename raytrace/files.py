@@ -60,7 +60,7 @@ def encoding(content: bytes) -> str:
     return "utf-8"
 
 
-def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
+def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> None:
     """Replace a file as a whole or not at all: `write` fills a temporary file, which is then renamed.
 
     The temporary file, in the same folder, has no name until complete, where the system allows that: a killed process
@@ -183,7 +183,7 @@ def write_json(path: str | os.PathLike, document: object) -> None:
     write_text(path, json.dumps(document, indent=1))
 
 
-def write_table(path: str | os.PathLike, rows: Iterable, columns: Sequence[str] = (), **spelling) -> None:
+def write_table(path: str | os.PathLike, rows: Iterable, columns: Sequence[str] = (), **spelling: Callable) -> None:
     """Write `table` of rows, as a whole or not at all."""
     write_text(path, table(rows, columns, **spelling))
 

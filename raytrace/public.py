@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Union, get_args, get_origin
+from typing import Any, Union, get_args, get_origin
 
 import torch
 from torch import Tensor
@@ -33,15 +33,15 @@ BATCHED = {
     *("with_object_distance", "with_sensor_distance"),
 }
 
-#: Modules whose classes are looked for; a module, an optimizer or a generator of torch may be anything alike.
+#: Modules whose classes are checked; a module, an optimizer or a generator of torch may be any similar object.
 _CHECKED = r"builtins|collections\.abc|os|pathlib|raytrace\..*|torch"
 _ITERABLE = {Sequence, Iterable, list, tuple}
 #: Classes as a message names them.
-_KINDS = {
+_KINDS: dict[Any, str] = {
     **{Tensor: "a tensor", str: "a text", os.PathLike: "a path", Path: "a path", int: "a whole number"},
     **{float: "a number", Sequence: "a sequence", Iterable: "a sequence", tuple: "a pair", Callable: "a function"},
 }
-#: Values that functions make, by the name of their class: how to get one.
+#: Values that functions make, by the name of their class: how to make one.
 _MADE = {"Element": "an Element of rt.elements (a name, a file) or rt.element (an array)"}
 #: Of an array where the name or the file of an element is expected.
 _OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=…, aperture=…, glass=…)"
@@ -49,24 +49,24 @@ _OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=…, aperture=�
 
 @functools.cache
 def public(function: Callable, name: str, home: str = "raytrace") -> Callable:
-    """A public function as a package, `home`, exports it under a name, with the signature and the text of the function.
+    """A public function as a package, `home`, exports it, with the signature and the docstring of the function.
 
-    It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
-    and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for
-    no lens, for unknown or missing options, and for numbers that are none, nan or of the wrong kind; RuntimeError
-    where `torch.func.vmap` hides numbers that the verb reads.
+    It reads a lens given as a path or as the name of a shipped lens, takes the other spelling of an option (SPELLINGS)
+    and single numbers where several are expected. Raises TypeError and ValueError, which name function and argument,
+    for no lens, for unknown or missing options, and for values that are no numbers, nan or of the wrong kind;
+    RuntimeError where `torch.func.vmap` hides numbers that the function reads.
     """
     parameters = inspect.signature(function).parameters
     names = tuple(parameters)
     sharing = computed_once if "lens" in parameters else contextlib.nullcontext
-    every = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
-    readers = {key: reader for key, one in parameters.items() if (reader := _reader(one))}
+    every = any(option.kind is option.VAR_KEYWORD for option in parameters.values())
+    readers = {key: reader for key, parameter in parameters.items() if (reader := _reader(parameter))}
 
     @functools.wraps(function)
-    def verb(*given, **options):
+    def verb(*given: Any, **options: Any) -> Any:
         options = {known_option(name, word, names, options, every): value for word, value in options.items()}
         _check_call(name, parameters, given, options)
-        taken = [_read(name, readers, *one) for one in zip(names, given, strict=False)]
+        taken = [_read(name, readers, word, value) for word, value in zip(names, given, strict=False)]
         taken += given[len(names) :]
         options = {word: _read(name, readers, word, value) for word, value in options.items()}
         try:
@@ -82,26 +82,25 @@ def public(function: Callable, name: str, home: str = "raytrace") -> Callable:
 
 
 def _check_call(verb: str, parameters: Mapping[str, inspect.Parameter], values: Sequence, words: Iterable[str]) -> None:
-    """Raises TypeError for values without a name beyond those that may come so, options given twice, or left out."""
+    """Raises TypeError for too many values without a name, and for options that are given twice or left out."""
     kinds = inspect.Parameter
-    placed = [
-        name for name, one in parameters.items() if one.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)
-    ]
-    several = any(one.kind is kinds.VAR_POSITIONAL for one in parameters.values())
+    by_place = kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD
+    placed = [name for name, option in parameters.items() if option.kind in by_place]
+    several = any(option.kind is kinds.VAR_POSITIONAL for option in parameters.values())
     if len(values) > len(placed) and not several:
-        options = [name for name, one in parameters.items() if one.kind is kinds.KEYWORD_ONLY]
+        options = [name for name, option in parameters.items() if option.kind is kinds.KEYWORD_ONLY]
         raise TypeError(f"{verb}: {nameless(values[len(placed)], options)}")
     read = {*placed[: len(values)]}
     for name in sorted(read & {*words}):
         raise TypeError(f"{verb}: {option(name)} is given twice, with and without its name: leave one out")
-    for name, one in parameters.items():
-        open_ended = one.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
-        if one.default is one.empty and not open_ended and name not in read and name not in words:
+    for name, parameter in parameters.items():
+        open_ended = parameter.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
+        if parameter.default is parameter.empty and not open_ended and name not in read and name not in words:
             raise TypeError(f"{verb}: {option(name)} is missing and has no default; add {name}=…")
 
 
 def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
-    """The error of a verb under `torch.func.vmap`, which reads numbers of the lens; other errors as they are."""
+    """The error of a function that reads numbers of the lens under `torch.func.vmap`; other errors as they are."""
     if not re.match(r"vmap:|Cannot access data pointer", str(error)):
         return error
     return RuntimeError(
@@ -111,7 +110,7 @@ def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
 
 
 def _reader(parameter: inspect.Parameter) -> Callable | None:
-    """What reads the values of a parameter, (verb, name, value) -> value; None if they pass as they are."""
+    """The reader of a parameter's values, (verb, name, value) -> value; None if they pass unchanged."""
     if parameter.name == "lens":
         others = _kinds(parameter.annotation) - {Lens, str, os.PathLike, Sequence}
         return functools.partial(_lens_or, tuple(others)) if others else _lens
@@ -130,17 +129,17 @@ def _reader_of_values(parameter: inspect.Parameter) -> Callable | None:
     if parameter.annotation in (float, float | None):
         return _number
     kinds = _kinds(parameter.annotation)
-    if not kinds or (kinds == {str} and parameter.default is not parameter.empty):  # a choice, which the verb lists
+    if not kinds or (kinds == {str} and parameter.default is not parameter.empty):  # a choice, which the function lists
         return None
     return functools.partial(_of_kinds, kinds)
 
 
 def _kinds(annotation: object) -> set[type]:
-    """The classes that an annotation names; none if one of them cannot be looked for."""
+    """The classes of an annotation; empty if one of them cannot be checked."""
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    found = {get_origin(part) or part for part in parts} - {NoneType}
-    checked = all(isinstance(kind, type) and re.fullmatch(_CHECKED, kind.__module__) for kind in found)
-    return found if checked and bool not in found else set()
+    kinds = {get_origin(part) or part for part in parts} - {NoneType}
+    checked = all(isinstance(kind, type) and re.fullmatch(_CHECKED, kind.__module__) for kind in kinds)
+    return kinds if checked and bool not in kinds else set()
 
 
 def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) -> object:
@@ -148,18 +147,18 @@ def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) 
     return value if reader is None else reader(verb, name, value)
 
 
-def _lens(verb: str, name: str, value: object) -> Lens:
+def _lens(verb: str, name: str, value: Any) -> Lens:
     if not isinstance(value, Lens):
         return as_lens(value, verb)
     if verb not in BATCHED and value.count is not None:
-        raise ValueError(f"{verb} takes one lens, not a batch of {value.count}: call it for each, `for one in lenses`")
+        raise ValueError(f"{verb} takes one lens, not a batch of {value.count}: call it for each, `for lens in lenses`")
     return value
 
 
 def _lens_or(kinds: tuple[type, ...], verb: str, name: str, value: object) -> object:
     """A lens, or one or several values of other classes, as elements."""
     several = value if isinstance(value, (list, tuple)) else [value]
-    return value if several and all(isinstance(one, kinds) for one in several) else _lens(verb, name, value)
+    return value if several and all(isinstance(part, kinds) for part in several) else _lens(verb, name, value)
 
 
 def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
@@ -181,12 +180,11 @@ def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
 
 
 def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:
-    """Numbers, of one or several; tensors as they are, their values unread."""
+    """Numbers, of one or several; tensors unchanged, their values unread."""
     if isinstance(value, Tensor):
-        found = value.reshape(1) if value.dim() == 0 else value
-        if found.numel() == 0:
+        if value.numel() == 0:
             raise ValueError(f"{verb}: {option(name)} is empty; expected {_numbers(name)}")
-        return found
+        return value.reshape(1) if value.dim() == 0 else value
     value = value.tolist() if hasattr(value, "tolist") else value  # of numpy and pandas
     if isinstance(value, Real):
         value = [value]

@@ -2,7 +2,9 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Self
+from typing import Any, Self, TypeVar
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -12,13 +14,13 @@ class Settings:
     seed: int = 0
 
     @classmethod
-    def of(cls, values: Mapping, **more) -> Self:
+    def of(cls, values: Mapping, **more: Any) -> Self:
         """Settings from those of the values that are fields and not None; `more` overrides them."""
-        named = {field.name: values.get(field.name) for field in dataclasses.fields(cls)}
-        return read(cls, {name: value for name, value in named.items() if value is not None} | more)
+        stated = {field.name: values.get(field.name) for field in dataclasses.fields(cls)}
+        return read(cls, {name: value for name, value in stated.items() if value is not None} | more)
 
 
-def read(kind: type, document: Mapping):
+def read(kind: type[T], document: Mapping) -> T:
     """A dataclass of plain fields from JSON, whose lists become tuples. Raises TypeError for fields of another kind."""
     return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
 

@@ -3,7 +3,7 @@
     torchrun --nproc-per-node 2 -m raytrace psf LENS …
 
 Every process takes its `Share`; `total` sums the parts, in all of them; within `agreeing` they also take the same
-decisions and fail together. A single process needs none of this, at no cost.
+decisions and fail together. In a single process they do nothing.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import NoReturn
 
 import torch
 from torch import Tensor, distributed
@@ -185,12 +186,12 @@ def _begin() -> "distributed.Store":
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """torchrun ends the other processes by SIGTERM if one fails: make that an error, so that files are cleaned up."""
+    """Within the block, SIGTERM, by which torchrun ends the others if a process fails, raises: files are cleaned up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
-    def end(number, frame):
+    def end(number: int, frame: object) -> NoReturn:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise ProcessLost("ended by torchrun, because another process of this job has failed")
 

@@ -6,9 +6,9 @@
 | `Records` | a file | its first line | lines, appended | `search` (journal) |
 | `Folder` | a folder | `settings.json` | files, replaced; lines, appended | training runs, experiments |
 
-A schema is a check: it takes a value of JSON and returns the value that is stored, or raises Unfit, which says what was
-found and expected. A file is replaced as a whole or not at all. Of lines, the incomplete one of a killed process is cut
-off, and damaged ones are reported by their number while the others hold.
+A schema is a check: it takes a value of JSON and returns the value that is stored, or raises Unfit with the value found
+and the value expected. A file is replaced as a whole or not at all. The incomplete line of a killed process is cut off;
+damaged lines are ignored and reported by their number.
 """
 
 import contextlib
@@ -23,22 +23,25 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, TypeAlias, TypeVar
 
 from raytrace.files import NotWritten, append_text, read_bytes, write_json, write_text
 from raytrace.shards import share
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
+T = TypeVar("T")
+
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
-Check = Callable[[object], object]
+Check: TypeAlias = Callable[[object], T]
 
 _MOST = 1 << 30  # bytes of a file
 _REPORTED = 5  # damaged lines of a file
 
 
 class Unfit(RaytraceError, ValueError):
-    """A value that a store cannot hold: what was found and what was expected; line: of the file, 0 if unknown."""
+    """A value that a store cannot hold; line: of the file, 0 if unknown."""
 
-    def __init__(self, message: str, line: int = 0):
+    def __init__(self, message: str, line: int = 0) -> None:
         super().__init__(message)
         self.line = line
 
@@ -50,7 +53,7 @@ class DamagedLine(RaytraceWarning):
 # -- schemas ----------------------------------------------------------------------------------------------------------
 
 
-def number(least: float = -math.inf, most: float = math.inf, *, infinite: bool = False) -> Check:
+def number(least: float = -math.inf, most: float = math.inf, *, infinite: bool = False) -> Check[float]:
     """A number from least to most, finite unless infinite ones are allowed."""
     words = "a number" if infinite else "a finite number"
     span = f" from {least:g}" * (least > -math.inf) + f" to {most:g}" * (most < math.inf)
@@ -67,7 +70,7 @@ def number(least: float = -math.inf, most: float = math.inf, *, infinite: bool =
     return check
 
 
-def whole(least: int = 0, most: int = 2**63 - 1) -> Check:
+def whole(least: int = 0, most: int = 2**63 - 1) -> Check[int]:
     """A whole number from least to most."""
 
     def check(value: object) -> int:
@@ -85,15 +88,15 @@ def text(value: object) -> str:
     return value
 
 
-def anything(value: object) -> object:
+def anything(value: object) -> Any:
     """Any value."""
     return value
 
 
-def either(*checks: Check) -> Check:
+def either(*checks: Check[Any]) -> Check[Any]:
     """A value of the first check that accepts it; the error is that of the last."""
 
-    def check(value: object) -> object:
+    def check(value: object) -> Any:
         for accepts in checks[:-1]:
             with contextlib.suppress(Unfit):
                 return accepts(value)
@@ -102,22 +105,23 @@ def either(*checks: Check) -> Check:
     return check
 
 
-def exactly(*values: object) -> Check:
+def exactly(*values: T) -> Check[T]:
     """One of these values."""
 
-    def check(value: object) -> object:
-        if not any(type(value) is type(allowed) and value == allowed for allowed in values):
-            raise Unfit(f"found {shown(value)}, expected {' or '.join(map(shown, values))}")
-        return value
+    def check(value: object) -> T:
+        for allowed in values:
+            if type(value) is type(allowed) and value == allowed:
+                return allowed
+        raise Unfit(f"found {shown(value)}, expected {' or '.join(map(shown, values))}")
 
     return check
 
 
-def listed(entry: Check, least: int = 0, most: int | None = None) -> Check:
+def listed(entry: Check[T], least: int = 0, most: int | None = None) -> Check[list[T]]:
     """A list of least to most entries, of any length if no most is given."""
     words = f"{least}" if least == most else f"{least} or more" if most is None else f"{least} to {most}"
 
-    def check(value: object) -> list:
+    def check(value: object) -> list[T]:
         if not isinstance(value, list):
             raise Unfit(f"found {shown(value)}, expected a list")
         if not least <= len(value) <= (len(value) if most is None else most):
@@ -127,15 +131,17 @@ def listed(entry: Check, least: int = 0, most: int | None = None) -> Check:
     return check
 
 
-def mapped(entry: Check) -> Check:
+def mapped(entry: Check[T]) -> Check[dict[str, T]]:
     """Names with values of one kind."""
     return lambda value: {name: _inside(name, entry, content) for name, content in _names(value).items()}
 
 
-def record(needed: Mapping[str, Check], optional: Mapping[str, Check] = MappingProxyType({})) -> Check:
-    """Names with values of their kinds; other names are left as they are."""
+def record(
+    needed: Mapping[str, Check[Any]], optional: Mapping[str, Check[Any]] = MappingProxyType({})
+) -> Check[dict[str, Any]]:
+    """Names with values of their kinds; other names pass unchanged."""
 
-    def check(value: object) -> dict:
+    def check(value: object) -> dict[str, Any]:
         names = _names(value)
         if missing := [name for name in needed if name not in names]:
             raise Unfit(f"{missing[0]!r} is missing")
@@ -145,20 +151,21 @@ def record(needed: Mapping[str, Check], optional: Mapping[str, Check] = MappingP
     return check
 
 
-def fields_of(kind: type, nullable: Sequence[str] = ()) -> Check:
+def fields_of(kind: type, nullable: Sequence[str] = ()) -> Check[dict[str, Any]]:
     """The plain fields of a dataclass: numbers, texts, names with numbers; nullable: names that may be null.
 
     Other names are refused, and defaults hold for those that are missing.
     """
-    of_type = {float: number(), int: whole(), str: text, dict[str, float]: mapped(number()), dict: mapped(anything)}
+    of_type: dict[object, Check[Any]] = {float: number(), int: whole(), str: text, dict: mapped(anything)}
+    of_type[dict[str, float]] = mapped(number())
     checks, needed = {}, {}
     for field in dataclasses.fields(kind):
-        check = of_type[typing.get_type_hints(kind)[field.name]]
-        checks[field.name] = either(exactly(None), check) if field.name in nullable else check
+        plain = of_type[typing.get_type_hints(kind)[field.name]]
+        checks[field.name] = either(exactly(None), plain) if field.name in nullable else plain
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             needed[field.name] = checks[field.name]
 
-    def check(value: object) -> dict:
+    def check(value: object) -> dict[str, Any]:
         if unknown := [name for name in _names(value) if name not in checks]:
             raise Unfit(f"found {unknown[0]!r}, expected {', '.join(checks)}")
         return record(needed, checks)(value)
@@ -166,13 +173,13 @@ def fields_of(kind: type, nullable: Sequence[str] = ()) -> Check:
     return check
 
 
-def _names(value: object) -> dict:
+def _names(value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise Unfit(f"found {shown(value)}, expected names and values")
     return value
 
 
-def _inside(name: str, check: Check, value: object) -> object:
+def _inside(name: str, check: Check[T], value: object) -> T:
     try:
         return check(value)
     except Unfit as error:
@@ -190,7 +197,7 @@ def shown(value: object) -> str:
     return json.dumps(value)[:60]
 
 
-def parsed(content: bytes) -> object:
+def parsed(content: bytes) -> Any:
     """The value of JSON in UTF-8. Raises Unfit."""
     try:
         return json.loads(content.decode("utf-8"))
@@ -207,11 +214,11 @@ def parsed(content: bytes) -> object:
 
 def read_file(
     path: str | os.PathLike,
-    decode: Callable[[bytes], object],
+    decode: Callable[[bytes], T],
     error: type[ValueError],
     advice: str,
     most: int | None = None,
-) -> object:
+) -> T:
     """The decoded content of a regular file of at most `most` bytes (default 1 GiB); decode raises Unfit.
 
     Raises OSError, and `error` with the file, its line, and the advice how to resume.
@@ -223,7 +230,7 @@ def read_file(
         raise error(f"{place}: {reason}; {advice}") from reason
 
 
-def read_document(path: str | os.PathLike, check: Check, error: type[ValueError], advice: str) -> object:
+def read_document(path: str | os.PathLike, check: Check[T], error: type[ValueError], advice: str) -> T:
     """The value of a JSON file. Raises as `read_file`."""
     return read_file(path, lambda content: check(parsed(content)), error, advice)
 
@@ -231,27 +238,29 @@ def read_document(path: str | os.PathLike, check: Check, error: type[ValueError]
 class Lines:
     """Records of a file, a line of JSON each, behind a first line of another kind if `head` is its check."""
 
-    def __init__(self, path: str | os.PathLike, record: Check, *, head: Check | None = None):
+    def __init__(self, path: str | os.PathLike, record: Check[Any], *, head: Check[Any] | None = None) -> None:
         self.path, self.record, self.head = Path(path), record, head
         self._end: int | None = None  # bytes of complete lines, where more follows
         self._gap = ""  # between the last record and the next
 
-    def encoded(self, value: object) -> str:
+    def encoded(self, value: Any) -> str:
         """The line of a record."""
         return json.dumps(value) + "\n"
 
-    def decoded(self, line: bytes, head: object) -> object:
+    def decoded(self, line: bytes, head: Any) -> Any:
         """The record of a line behind a head; of the first line, the head itself. Raises Unfit."""
         return (self.head if head is None and self.head else self.record)(parsed(line))
 
-    def scan(self, error: type[ValueError], advice: str) -> tuple[object, list[tuple[int, object]], list[str]]:
-        """The head, None where there is none, every record with the number of its line, and damaged lines in words.
+    def scan(self, error: type[ValueError], advice: str) -> tuple[Any, list[tuple[int, Any]], list[str]]:
+        """The head, None where there is none, every record with the number of its line, and messages of damaged lines.
 
         Raises OSError, and `error` with the advice for a damaged head.
         """
         content = read_bytes(self.path, _MOST) if self.path.exists() else b""
         *lines, torn = content.split(b"\n")
-        head, records, damaged = None, [], []
+        head: Any = None
+        records: list[tuple[int, Any]] = []
+        damaged: list[str] = []
         self._end, self._gap = None, ""
         for number, line in enumerate([*lines, torn] if torn else lines, 1):
             is_head, is_torn = number == 1 and self.head is not None, number > len(lines)
@@ -272,7 +281,7 @@ class Lines:
             self._gap = "\n" if is_torn else ""
         return head, records, damaged
 
-    def read(self, error: type[ValueError], advice: str) -> tuple[object, list[tuple[int, object]]]:
+    def read(self, error: type[ValueError], advice: str) -> tuple[Any, list[tuple[int, Any]]]:
         """The head, and every record with the number of its line. Warns DamagedLine; raises as `scan`."""
         head, records, damaged = self.scan(error, advice)
         for words in damaged[:_REPORTED]:
@@ -296,7 +305,7 @@ class Lines:
 class Table(Lines):
     """Rows of numbers as CSV, the first of a row a whole number, under a line of column names."""
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike) -> None:
         super().__init__(path, anything, head=anything)
 
     def encoded(self, value: Sequence) -> str:
@@ -349,20 +358,20 @@ class Kind:
     difference: Callable[[Mapping, Mapping], str] = changed
     lost: str = "the computation continues, but cannot resume from here"
 
+    def verify(self, path: Path | None, before: Mapping, now: Mapping) -> None:
+        """Raise `other` for a store of another identity."""
+        if difference := self.difference(before, now):
+            raise self.other(self.refusal.format(path=path, difference=difference))
+
 
 class Store:
-    """Records of one computation in a file or folder. Only the first of several processes writes.
+    """Records of one computation in a file. Only the first of several processes writes.
 
-    path: None stores nothing; of: the identity, everything that the records depend on, as plain values for JSON.
+    path: None stores nothing; identity: everything that the records depend on, as plain values for JSON.
     """
 
-    def __init__(self, path: str | os.PathLike | None, of: Mapping, kind: Kind):
-        self.path, self.of, self.kind = None if path is None else Path(path), of, kind
-
-    def verify(self, before: Mapping) -> None:
-        """Raise the error of the kind for another identity."""
-        if words := self.kind.difference(before, self.of):
-            raise self.kind.other(self.kind.refusal.format(path=self.path, difference=words))
+    def __init__(self, path: str | os.PathLike | None, identity: Mapping, kind: Kind) -> None:
+        self.path, self.identity, self.kind = None if path is None else Path(path), identity, kind
 
     def keep(self, write: Callable[..., None], *values: object) -> None:
         """Write by a function. Warns NotWritten where that fails: the computation continues and stores nothing more."""
@@ -379,30 +388,33 @@ class Store:
 class Document(Store):
     """A file of one record, {"of": the identity, …}, replaced as a whole."""
 
-    def read(self, check: Check) -> object:
+    def read(self, check: Check[T]) -> T:
         """The checked record. Raises OSError and the errors of the kind."""
+        if self.path is None:
+            raise FileNotFoundError("no file of this record; give its path")
 
-        def checked(value: object) -> object:
-            if "of" not in _names(value):
-                raise Unfit("does not say what it is of; an older version wrote it")
-            self.verify(_inside("of", mapped(anything), value["of"]))
+        def checked(value: object) -> T:
+            names = _names(value)
+            if "of" not in names:
+                raise Unfit("has no identity ('of'); an older version wrote it")
+            self.kind.verify(self.path, _inside("of", mapped(anything), names["of"]), self.identity)
             return check(value)
 
         return read_document(self.path, checked, self.kind.damaged, self.kind.advice)
 
     def write(self, values: Mapping) -> None:
         """Replace the record. Warns NotWritten."""
-        self.keep(write_json, self.path, {"of": self.of, **values})
+        self.keep(write_json, self.path, {"of": self.identity, **values})
 
 
 class Records(Store):
     """A file of appended records, a line of JSON each, behind a first line that holds the identity."""
 
-    def __init__(self, path: str | os.PathLike | None, of: Mapping, kind: Kind, check: Check):
-        super().__init__(path, of, kind)
+    def __init__(self, path: str | os.PathLike | None, identity: Mapping, kind: Kind, check: Check[Any]) -> None:
+        super().__init__(path, identity, kind)
         self.lines = None if path is None else Lines(path, check, head=mapped(anything))
 
-    def read(self) -> list[tuple[int, object]]:
+    def read(self) -> list[tuple[int, Any]]:
         """Every record with the number of its line; a missing file is started.
 
         Warns DamagedLine. Raises OSError and the errors of the kind.
@@ -411,36 +423,37 @@ class Records(Store):
             return []
         before, records = self.lines.read(self.kind.damaged, self.kind.advice)
         if before is not None:
-            self.verify(before)
+            self.kind.verify(self.path, before, self.identity)
         elif not share().rank:
-            self.lines.begin(self.of)
+            self.lines.begin(self.identity)
         return records
 
     def append(self, value: object) -> None:
         """Add a record. Warns NotWritten."""
-        self.keep(lambda: self.lines.append(value))
+        if self.lines is not None:
+            self.keep(self.lines.append, value)
 
 
-class Folder(Store):
+class Folder:
     """A folder with the identity in `settings.json`; it is made, and refused if it has another identity.
 
     usual: defaults of settings that a folder of an older version does not have.
     """
 
     def __init__(
-        self, path: str | os.PathLike, of: Mapping, kind: Kind, *, usual: Mapping = MappingProxyType({})
-    ):  # fmt: skip
-        of, usual = (json.loads(json.dumps(dict(values))) for values in (of, usual))
-        super().__init__(path, of, kind)
+        self, path: str | os.PathLike, identity: Mapping, kind: Kind, *, usual: Mapping = MappingProxyType({})
+    ) -> None:
+        now, defaults = (json.loads(json.dumps(dict(values))) for values in (identity, usual))
+        self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / "settings.json"
         if file.exists():
             before = read_document(file, mapped(anything), kind.damaged, kind.advice)
-            self.verify({key: value for key, value in usual.items() if key in of} | before)
+            kind.verify(self.path, {key: value for key, value in defaults.items() if key in now} | before, now)
         elif not share().rank:
-            write_json(file, of)
+            write_json(file, now)
 
-    def record(self, name: str, compute: Callable, *, write: Callable, read: Callable) -> object:
+    def record(self, name: str, compute: Callable, *, write: Callable, read: Callable[[Path], T]) -> T:
         """The record of a file, by `read(path)`; where there is none it is computed and stored by `write(path, …)`."""
         file = self.path / name
         if not file.exists():

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from numbers import Real
 from pathlib import Path
+from typing import TypeVar, cast
 
 _PACKAGE = str(Path(__file__).parent)
 
@@ -38,11 +39,13 @@ SPELLINGS = (
     ("radius", "radii"),
     ("wavelength", "wavelengths"),
 )
-_OTHER = {one: other for pair in SPELLINGS for one, other in (pair, pair[::-1])}
+_OTHER = {**dict(SPELLINGS), **{several: single for single, several in SPELLINGS}}
+
+Method = TypeVar("Method", bound=Callable)
 
 
-def both_spellings(method: Callable) -> Callable:
-    """A method of keywords alone that takes both spellings of an option, and refuses unknown ones in words."""
+def both_spellings(method: Method) -> Method:
+    """A method of keywords alone that takes both spellings of an option. Raises TypeError for unknown options."""
     names = tuple(inspect.signature(method).parameters)[1:]
 
     @functools.wraps(method)
@@ -52,11 +55,11 @@ def both_spellings(method: Callable) -> Callable:
         known = {known_option(method.__qualname__, word, names, options): value for word, value in options.items()}
         return method(self, **known)
 
-    return read
+    return cast(Method, read)
 
 
 def known_option(verb: str, word: str, names: tuple[str, ...], options: Mapping, every: bool = False) -> str:
-    """An option as the verb spells it. Raises TypeError for one that it does not have, or that is given twice."""
+    """An option as a public function spells it. Raises TypeError for an unknown option, or one that is given twice."""
     if word in names:
         return word
     other = _OTHER.get(word)
@@ -109,14 +112,14 @@ def with_options(text: str) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """What may have been meant by a word, of the known ones, as the end of a message; empty if nothing is near."""
+    """The known word nearest to a word, as the end of a message; empty if none is near."""
     spelled = {name.lower(): name for name in known}
     near = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.7)
     return f"; did you mean {spelled[near[0]]}?" if near else ""
 
 
 def named(part: object) -> str:
-    """The kind of a value as a sentence calls it: "an ideal lens", of an IdealLens."""
+    """The class of a value as a noun with its article: "an ideal lens", of an IdealLens."""
     return with_article(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower())
 
 

@@ -11,8 +11,8 @@ from problems import fields, lens, surface
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.materials.glass import model_glass
+from raytrace.optimization.attained import NotReached
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.optimize import NotReached
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.optimization_data import OptimizationData, Row, Vary

@@ -35,9 +35,9 @@ from raytrace.imaging.codesign import (
     with_catalog_glasses,
 )
 from raytrace.imaging.field_kernels import DarkPlaces, order_of
-from raytrace.imaging.image import blur, transfer_functions
+from raytrace.imaging.image import blur, decoded, linearised, transfer_functions
 from raytrace.imaging.pictures import dead_leaves, split
-from raytrace.imaging.render import decoded, linearised, render_patches
+from raytrace.imaging.render import render_patches
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import OtherLens

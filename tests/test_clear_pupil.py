@@ -9,7 +9,7 @@ from problems import double_gauss, lens, scalar, surface, vector
 from raytrace.psf_models.drt import trace_clearances
 from raytrace.system.surface import Aperture
 from raytrace.tracing import clear_pupil as clear_pupil_module
-from raytrace.tracing.clear_pupil import Arms, arms_of
+from raytrace.tracing.clear_pupil import Arms, Edges, Kinks, arms_of
 from raytrace.tracing.scene import Scene, scene
 
 RADIUS = 5.0  # of the entrance pupil, mm
@@ -129,7 +129,10 @@ def test_rings_integrate_odd_powers_between_arms_of_unlike_length():
     unit = torch.stack([torch.cos(angle), torch.sin(angle)])[:, None, None, None]
     outer = (2 * 0.4 * unit[0]).clamp_min(0.0)
     share = torch.full_like(outer, 1 / 64)
-    arms = Arms(torch.zeros(2, 1, 1, 1, dtype=torch.float64), unit, share, torch.zeros_like(outer), outer, 0)
+    radius, none = torch.stack([torch.zeros_like(outer), outer]), outer[..., :0]
+    edges = Edges(radius, torch.zeros_like(radius, dtype=torch.int64), torch.zeros_like(radius), outer > 0)
+    kinks = Kinks(none, none, edges.number[..., :0], 64)
+    arms = Arms(torch.zeros(2, 1, 1, 1, dtype=torch.float64), unit, share, *radius, 0, edges, kinks)
     points, weights = arms.rule(4)
     # (1/π) ∫ (2 a cos θ)⁵/5 dθ over the right half, ∫ cos⁵ = 16/15.
     expected = 0.8**5 / 5 * (16 / 15) / math.pi

@@ -12,9 +12,9 @@ from problems import vector
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
+from raytrace.optimization.attained import attained
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.optimize import reached
 from raytrace.optimization.problem import WORDS, BadHold, Problem, conditions_of
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Fields, is_round_about_axis
@@ -154,7 +154,7 @@ def test_a_condition_reports_the_number_of_the_analysis_of_its_name(name):
     conditions = conditions_of(lens, ["distortion<=9%" if word == "distortion" else f"{word}<=1e9" for word in WORDS])
     model = DesignVariables(lens, (Vary(1, "curvature"),))
     problem = Problem(model, [Row("EFFL", target=1.0, weight=1.0)], conditions)
-    numbers = {one.name: one.reached for one in reached(problem, model.start, lower=model.start, upper=model.start)}
+    numbers = {one.name: one.reached for one in attained(problem, problem.evaluated(model.start))}
     assert [*numbers] == [*WORDS] == [*ANALYSES]
     expected = {word: analysis(lens) for word, analysis in ANALYSES.items()}
     assert numbers.pop("distortion") == pytest.approx(expected.pop("distortion"), rel=1e-7, abs=1e-8)

@@ -81,7 +81,7 @@ def test_models_are_compared_where_a_surface_is_curved():
     ideal = rt.lens(
         [dict(thickness=50.0, phase=rt.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
     )
-    with pytest.raises(ValueError, match="no surface of this lens that bends light is curved; ask for kernels"):
+    with pytest.raises(ValueError, match="no refracting or reflecting surface of this lens is curved; ask for kernels"):
         abilities(ideal)
 
 

@@ -41,7 +41,7 @@ def test_indices_have_derivatives():
     ("wavelengths", "indices", "message"),
     [
         ([0.46, 0.55], [1.5], "1 indices at 2 wavelengths"),
-        ([0.46, 0.46], [1.5, 1.5], "stands twice"),
+        ([0.46, 0.46], [1.5, 1.5], "occurs twice"),
         ([0.46, 0.0], [1.5, 1.5], "expected finite, positive"),
         ([], [], "0 indices"),
     ],

@@ -16,7 +16,7 @@ from raytrace.imaging.variables import OtherLens, Variables
 from raytrace.io import read_lens
 from raytrace.materials.glass import abbe_number, nd
 from raytrace.maths.sampling import gauss_rings
-from raytrace.optimization.optimize import NotReached
+from raytrace.optimization.attained import NotReached
 from raytrace.optimization.variables import VariedGlass, design_variables
 from raytrace.settings import CodesignSettings
 from raytrace.system import configurations

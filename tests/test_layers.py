@@ -58,6 +58,7 @@ COMMANDS = re.compile(r"cli(\.|$)")
 SHOWN_BY = {
     "system.lens": ("tracing.lens_report", "analysis.layout"),
     "psf_models.result": ("psf_models.figures",),
+    "optimization.optimized": ("optimization.optimized_figure",),
 }
 
 #: Libraries that are imported when they are first needed, inside functions.

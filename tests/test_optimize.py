@@ -13,9 +13,9 @@ from scripts import script
 
 import raytrace as rt
 from raytrace.optimization import least_squares as paths
-from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOptions, State, least_squares
+from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOptions, SumOfSquares, least_squares
 from raytrace.optimization.merit import DefaultMerit
-from raytrace.optimization.optimize import optimize_report
+from raytrace.optimization.optimized_figure import optimize_report
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
 from raytrace.optimization.variables import design_variables, name_of
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
@@ -79,7 +79,7 @@ def squares(residuals, jacobian, held=None):
     def state(x, derivatives):
         n = len(x)
         c, A = (NONE, np.zeros((0, n))) if held is None else held(x)
-        return State(
+        return SumOfSquares(
             x, residuals(x), 0, Sides.none(n), c, NONE, jacobian(x) if derivatives else None, A, np.zeros((0, n))
         )
 

@@ -17,6 +17,7 @@ from raytrace.optimization.checkpoint import BadCheckpoint
 from raytrace.optimization.glass_choice import (
     STATUSES,
     Choice,
+    DescendedDesign,
     Design,
     Pool,
     catalogs_of,
@@ -24,7 +25,7 @@ from raytrace.optimization.glass_choice import (
     hull,
     pool_of,
 )
-from raytrace.optimization.least_squares import Sides, State, least_squares
+from raytrace.optimization.least_squares import Sides, SumOfSquares, least_squares
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.variables import design_variables, without_glass
@@ -109,7 +110,7 @@ def test_the_expansion_of_a_linear_merit_predicts_the_minimum():
     draw = np.random.default_rng(2)
     J, r = draw.normal(size=(30, 7)), draw.normal(size=30)
     A, c = draw.normal(size=(1, 7)), draw.normal(size=1)
-    state = State(np.zeros(7), r, 0, Sides.none(7), c, NONE, J, A, np.zeros((0, 7)))
+    state = SumOfSquares(np.zeros(7), r, 0, Sides.none(7), c, NONE, J, A, np.zeros((0, 7)))
     foretold = expansion(state, np.array([5, 6]), np.arange(5), np.zeros((0, 7)))
     for d in draw.normal(size=(5, 2)):
         system = np.block([[J[:, :5].T @ J[:, :5], A[:, :5].T], [A[:, :5], np.zeros((1, 1))]])
@@ -128,12 +129,12 @@ def test_predicted_merits_rank_the_optimised_merits(triplet):
         upper=choice.bounds[1], cycles=60,
     )  # fmt: skip
     own = {k: triplet.surfaces[k].glass for k in choice.surfaces}
-    design = Design(start.state.x, own, start.state)
+    design = DescendedDesign(start.state.x, own, start.state)
     for surface in choice.surfaces:
         merits = choice.predicted(design, [surface], ())[surface]
         some = np.argsort(merits)[:60:5]
         glasses = [choice.candidates[surface][0][i] for i in some]
-        reached = [choice.descend(Design(design.x, own | {surface: g}, None), (), 15).merit for g in glasses]
+        reached = [choice.descend(Design(design.x, own | {surface: g}), (), 15).merit for g in glasses]
         assert spearmanr(merits[some], reached)[0] > 0.6
 
 

@@ -8,7 +8,7 @@ import torch
 
 import raytrace as rt
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.optimize import opened
+from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import Problem
 from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables
 

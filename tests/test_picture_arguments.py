@@ -6,7 +6,7 @@ import torch
 from problems import generator
 
 import raytrace as rt
-from raytrace.imaging.render import decoded
+from raytrace.imaging.image import decoded
 from raytrace.imaging.restoration import mean_square_error
 
 GREY = torch.arange(2 * 24 * 24, dtype=torch.int64).reshape(2, 24, 24).mul(37).remainder(256).to(torch.uint8)

@@ -139,7 +139,7 @@ def reference(model: str, lens: Lens, options: dict):
             computed = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
         else:
             computed = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
-        return polychromatic(computed, options["wavelength_weights"], model)
+        return polychromatic(computed, batch, options["wavelength_weights"], model)
 
 
 def dense_gaussian(batch: Scene, window) -> Kernels:

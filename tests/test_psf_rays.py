@@ -1,6 +1,7 @@
 """Splats and ray-traced PSFs: energy, brute force, bias of the blur, derivatives with vignetted rays."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -225,3 +226,19 @@ def test_pupil_points_are_the_rays_of_a_kernel():
         psf(lens, Wave(rays=points), **about)
     with pytest.raises(ValueError, match=r"pupil points \(2, P\)"):
         psf(lens, DRT(rays=points[0]), **about)
+
+
+def test_rays_of_two_shares_have_the_light_of_all():
+    """Each of two processes traces half of the points: their kernels add up to the kernel of all."""
+    of = scene_of(sharp_double_gauss(), 5.0)
+    pixels = window(of, pitch=0.02)
+    whole = kernels_of_rays(of, pixels, rays=60)
+
+    def half(count, part, **like):
+        points, weights = sobol(count, **like)
+        return points[:, part::2], weights[part::2]
+
+    parts = [kernels_of_rays(of, pixels, rays=60, sampling=partial(half, part=part)) for part in (0, 1)]
+    torch.testing.assert_close(sum(part.kernel for part in parts), whole.kernel, rtol=0, atol=1e-14)
+    torch.testing.assert_close(sum(part.arrived for part in parts), whole.arrived, rtol=0, atol=1e-14)
+    assert {part.rays for part in parts} == {60}

@@ -14,15 +14,13 @@ import raytrace as rt
 from raytrace.budget import OverBudget, within
 from raytrace.imaging import field_kernels
 from raytrace.imaging.field_kernels import FieldKernels, WindowTooLarge, channel_moments
-from raytrace.imaging.image import blur, blur_layers, depth_masks
+from raytrace.imaging.image import blur, blur_layers, depth_masks, encoded, linearised
 from raytrace.imaging.render import (
     BeyondFields,
     ImageFormation,
     Rendering,
     _over_response,
     default_sensor,
-    encoded,
-    linearised,
     optics,
     render_patches,
 )

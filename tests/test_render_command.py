@@ -12,7 +12,8 @@ from PIL import Image
 
 import raytrace as rt
 from raytrace.imaging import render
-from raytrace.imaging.render import default_sensor, encoded
+from raytrace.imaging.image import encoded
+from raytrace.imaging.render import default_sensor
 from raytrace.io.pictures import PictureError, read_channels, read_depth, read_levels
 from raytrace.system.identity import digest
 from raytrace.system.lens import field_points

@@ -16,8 +16,8 @@ import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
+from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
-from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, conditions_of
 from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
 from raytrace.optimization.search import Minima
@@ -131,9 +131,9 @@ def test_a_minimum_is_kept_once_and_the_best_of_its_finds():
     assert minima.add(ended([0.5, 0.9], 2.0), "c", 3)
     assert minima.add(ended([0.1, 0.1], 1.0), "d", 4)
     assert not minima.add(ended([0.9, 0.1], 0.1, lost=1), "e", 5)
-    assert [(one.task, one.found) for one in minima.each] == [("d", 1), ("a", 2), ("c", 1)]
+    assert [(one.task, one.descents) for one in minima.each] == [("d", 1), ("a", 2), ("c", 1)]
     assert minima.add(ended([0.505, 0.5], 1.99), "f", 6)
-    assert [(one.task, one.found) for one in minima.each] == [("d", 1), ("f", 3), ("c", 1)]
+    assert [(one.task, one.descents) for one in minima.each] == [("d", 1), ("f", 3), ("c", 1)]
 
 
 def test_a_lens_and_the_same_turned_round_are_one():
@@ -144,7 +144,7 @@ def test_a_lens_and_the_same_turned_round_are_one():
 
 def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
     assert len(found.lenses) == 1
-    assert found.found.tolist() == [8]  # four starts that are followed, and four hops
+    assert found.times_reached.tolist() == [8]  # four starts that are followed, and four hops
     assert found.lens is found.lenses[0]
 
 
@@ -345,7 +345,7 @@ def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
     assert 1 + 4 <= len(kept) < 1 + 8
     whole = rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, **HOW)
     assert torch.equal(whole.variables, found.variables)
-    assert torch.equal(whole.found, found.found)
+    assert torch.equal(whole.times_reached, found.times_reached)
     assert whole.tasks == found.tasks
     assert not (tmp_path / "nearest.zmx").exists()
 

@@ -11,7 +11,7 @@ from test_layers import parsed
 
 @pytest.mark.parametrize(
     ("computation", "most"),
-    [("read_lens", 10), ("refraction", 5), ('psf(lens, "drt")', 16), ("optimize", 28), ("training step", 21)],
+    [("read_lens", 10), ("refraction", 5), ('psf(lens, "drt")', 16), ("optimize", 28), ("training step", 23)],
 )
 def test_a_computation_runs_through_few_files_and_calls_no_higher_layer(computation, most):
     files, upward = structure.walked(structure.walks()[computation])

@@ -50,7 +50,7 @@ def test_copies_of_the_image_in_the_window_are_refused_and_are_wrong(samples):
     with pytest.raises(AliasedSampling, match="repeat the image every"):
         plan(s, engine="pupil", samples=samples)
     sums = pupil.prepare(s, samples, 4)
-    aliased = integrate(pupil.intensity(s, sums), sums.pixel, s.grid.pitch)
+    aliased = integrate(pupil.intensity(s, sums), sums.to_pixels.pixel, s.grid.pitch)
     assert relative(aliased, psf(s).kernel) > 1
 
 

@@ -53,13 +53,9 @@ def along_x(s, x, samples=256):
     wavelength = 1e-3 * s.wavelengths
     r2 = sums.x[0] ** 2 + sums.y[0] ** 2
     t = sums.x[0] / torch.sqrt(r2 * s.exact + s.sensor_distance**2)
-    unfolded = dataclasses.replace(
-        sums,
-        along_x=pupil.waves_at(x, t, wavelength),
-        along_y=pupil.waves_at(torch.zeros(1, dtype=x.dtype), t, wavelength),
-        folded=False,
-    )
-    return pupil.intensity(s, unfolded)[..., 0, :]
+    across = pupil.waves_at(torch.zeros(1, dtype=x.dtype), t, wavelength)
+    unfolded = pupil.ToPixels(pupil.waves_at(x, t, wavelength), across, sums.to_pixels.pixel)
+    return pupil.intensity(s, dataclasses.replace(sums, to_pixels=unfolded))[..., 0, :]
 
 
 def relative(result, expected):
@@ -269,7 +265,9 @@ def test_integrals_over_pixels_add_up():
     total = psf(fine, tol=1e-6).energy
     sums = pupil.prepare(coarse, 256, 48)
     assert torch.allclose(
-        total, integrate(pupil.intensity(coarse, sums), sums.pixel, coarse.grid.pitch).sum((-2, -1)), atol=1e-4
+        total,
+        integrate(pupil.intensity(coarse, sums), sums.to_pixels.pixel, coarse.grid.pitch).sum((-2, -1)),
+        atol=1e-4,
     )
 
 

@@ -18,7 +18,7 @@ import torch
 import raytrace as rt
 from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.experiments import Store
-from raytrace.optimization.optimize import drawn_fields
+from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.plotting.style import new_figure, save
 from raytrace.tolerancing.as_built import AsBuiltTerm
 from raytrace.tolerancing.study import moments

@@ -23,9 +23,8 @@ from torch import Tensor
 
 import raytrace as rt
 from raytrace.files import write_json
-from raytrace.imaging.image import add_noise, blur, count_electrons, transfer_functions
+from raytrace.imaging.image import add_noise, blur, count_electrons, linearised, transfer_functions
 from raytrace.imaging.pictures import draws, files, read, split
-from raytrace.imaging.render import linearised
 from raytrace.imaging.restoration import depth_invariant_wiener, kernel_error, mean_square_error, power_spectrum
 from raytrace.imaging.training import read_json
 from raytrace.plotting.style import FIELD_COLOURS, GREY, new_figure

@@ -49,9 +49,8 @@ from raytrace.imaging.codesign import (
     spectrum_of,
     steps_per_epoch,
 )
-from raytrace.imaging.image import blur
+from raytrace.imaging.image import blur, encoded
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, draws, files, read, split
-from raytrace.imaging.render import encoded
 from raytrace.imaging.restoration import psnr, restore
 from raytrace.imaging.training import Run, load_state, read_json, read_state, train
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure

@@ -25,9 +25,8 @@ from torch import Tensor
 
 import raytrace as rt
 from raytrace.files import write_json
-from raytrace.imaging.image import add_noise, blur, transfer_functions
+from raytrace.imaging.image import add_noise, blur, linearised, transfer_functions
 from raytrace.imaging.pictures import Pictures, crop, digest, files, read, split
-from raytrace.imaging.render import linearised
 from raytrace.imaging.restoration import (
     cross_spectrum,
     depth_invariant_wiener,

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.panels import SAGITTAL, chart, drawn_at_least, finished, over_field
-from raytrace.analysis.result import OverField
+from raytrace.analysis.panels import SAGITTAL, chart, drawn_at_least, finished, over_field, seen
+from raytrace.analysis.result import OverField, shown
 from raytrace.analysis.setting import (
     NothingToShow,
     Numbers,
@@ -15,13 +15,12 @@ from raytrace.analysis.setting import (
     in_object_space,
     refuse_axis,
     setting,
-    shown,
     unvignetted,
 )
 from raytrace.analysis.spot_diagram import airy_radius
-from raytrace.maths.numerics import divide, dot_2, safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import Number, divide, dot_2, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, masked
-from raytrace.plotting.style import FAINT, new_figure, styled
+from raytrace.plotting.style import FAINT, Figure, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.launch import is_at_infinity
 from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
@@ -35,7 +34,7 @@ NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberra
 
 @value
 class Distortion(OverField):
-    """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
+    """Heights (F, W) in mm of chief rays on the sensor, and their relative error against the ideal image.
 
     height: from the vertex of the sensor, along the meridian of the field, positive towards +y (+x where it is the x
         axis), as the ray's own y; where the axis bends, along the image of the meridian. `image_height` of `hold` is
@@ -61,22 +60,23 @@ class Distortion(OverField):
     def columns(self) -> dict[str, Tensor]:
         relative = {"f_tan_percent": self.f_tan, "f_theta_percent": self.f_theta}
         percent = {name: 100 * curve for name, curve in relative.items() if curve is not None}
-        found = {name: masked(curve, self.valid) for name, curve in {"height": self.height, **percent}.items()}
-        return {**self.heads(wavelength=self.wavelengths), **found}
+        shown = {name: masked(curve, self.valid) for name, curve in {"height": self.height, **percent}.items()}
+        return {**self.heads(wavelength=self.wavelengths), **shown}
 
     def at(self, fields: Tensor) -> "Distortion":
         return distortion_of(self.lens, fields)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Distortion in percent over the field: against f tan θ, and against f θ where the object is at infinity."""
         curves = self.drawn()
-        infinite = curves.f_theta is not None
-        ideals = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta} if infinite else {"Height": curves.f_tan}
+        ideals = {"Height": curves.f_tan}
+        if curves.f_theta is not None:
+            ideals = {"F-tan θ": curves.f_tan, "F-θ": curves.f_theta}
         figure = new_figure(3.1 * len(ideals) + 0.9, 4.2)
         panels = figure.subplots(1, len(ideals), squeeze=False)[0]
         for panel, (name, values) in zip(panels, ideals.items(), strict=True):
-            over_field(panel, curves, 100 * values)
+            over_field(panel, curves, seen(100 * values, curves.valid))
             panel.set_xlabel(f"{name} distortion (%)")
             drawn_at_least([panel], 1e-6, "x")
         return finished(panels[-1], curves, "distortion", len(curves.wavelengths))
@@ -106,12 +106,12 @@ class FieldCurvature(OverField):
         return field_curvature_of(self.lens, fields)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Foci of close rays over the field: tangential solid, sagittal dashed."""
         curves = self.drawn()
-        _, panel = chart(4.6, 4.4, "focus from the sensor (mm)", "")
-        over_field(panel, curves, curves.tangential, suffix=" T", dashes=("solid",))
-        over_field(panel, curves, curves.sagittal, suffix=" S", dashes=(SAGITTAL,))
+        panel = chart(4.6, 4.4, "focus from the sensor (mm)", "")
+        over_field(panel, curves, seen(curves.tangential, curves.valid), suffix=" T", dashes=("solid",))
+        over_field(panel, curves, seen(curves.sagittal, curves.valid), suffix=" S", dashes=(SAGITTAL,))
         drawn_at_least([panel], 1e-6, "x")
         return finished(panel, curves, "field curvature", 2 if len(curves.wavelengths) < 3 else 3)
 
@@ -138,13 +138,13 @@ class LateralColour(OverField):
         return lateral_colour_of(self.lens, fields)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Chief-ray heights less that of the primary wavelength over the field; its Airy radius is grey."""
         curves = self.drawn()
-        _, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
+        panel = chart(4.6, 4.4, "lateral colour (µm)", "")
         if math.isfinite(airy := 1e3 * float(airy_radius(curves.lens))):
             panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
-        over_field(panel, curves, 1e3 * curves.shift)
+        over_field(panel, curves, seen(1e3 * curves.shift, curves.valid))
         if not panel.patches:
             drawn_at_least([panel], 1e-3, "x")
         return finished(panel, curves, "lateral colour", 4)
@@ -155,8 +155,8 @@ def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None
 
     Relative, in per cent in the table. Heights count from the vertex of the sensor; the ideal image, and with it the
     distortion, from the image of the axis, so that a shift of the whole image is none. The scale of the ideal image is
-    that of each wavelength's own chief ray close to the axis, on the sensor as it stands: an image out of focus is not
-    distorted for that. wavelengths: µm. Raises NothingToShow for the axis alone.
+    that of each wavelength's own chief ray close to the axis, on the sensor at its position: defocus is no
+    distortion. wavelengths: µm. Raises NothingToShow for the axis alone.
     """
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     refuse_axis(fields)
@@ -166,7 +166,7 @@ def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None
 def distortion_of(lens: Lens, fields: Tensor) -> Distortion:
     """The distortion of fields (2, F), which need not be in reach."""
     bare = unvignetted(lens)
-    described, angles, extent, found = in_object_space(bare, fields)
+    described, angles, extent, exist = in_object_space(bare, fields)
     close = _close_fields(lens, fields)
     _, close_angles, close_extent, _ = in_object_space(bare, close)
     length = dot_2(fields, _meridian(fields)).sign() * safe_sqrt(dot_2(extent, extent))
@@ -178,7 +178,7 @@ def distortion_of(lens: Lens, fields: Tensor) -> Distortion:
     scale = _height(described, close_angles, close, from_axis=True)[0] / reach[:, None]
     ideal = scale * length[:, None]
     f_theta = relative_error(image, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
-    return Distortion(lens, fields, height, ideal, relative_error(image, ideal), f_theta, valid & found[:, None])
+    return Distortion(lens, fields, height, ideal, relative_error(image, ideal), f_theta, valid & exist[:, None])
 
 
 def field_curvature(
@@ -205,7 +205,8 @@ def field_curvature_of(lens: Lens, fields: Tensor) -> FieldCurvature:
     alike = bool((along == along[:, :1]).all())
     groups = [(fields, along[:, :1])] if alike else zip(fields.split(1, 1), along.split(1, 1), strict=True)
     each = [_close_foci(bare, group, meridian) for group, meridian in groups]
-    return FieldCurvature(lens, fields, *(torch.cat(found) for found in zip(*each, strict=True)))
+    tangential, sagittal, valid = (torch.cat(parts) for parts in zip(*each, strict=True))
+    return FieldCurvature(lens, fields, tangential, sagittal, valid)
 
 
 def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -226,7 +227,7 @@ def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tens
             apart, opening = (dot_2(part, section[:, :, None]) for part in (apart, opening))
             foci.append(focus_of_close_rays(apart, opening))
         exist.append(opening.abs() > 8 * torch.finfo(opening.dtype).eps)
-    tangential, sagittal = (torch.where(there, at, torch.nan) for there, at in zip(exist, foci, strict=True))
+    tangential, sagittal = (torch.where(exists, focus, torch.nan) for exists, focus in zip(exist, foci, strict=True))
     return tangential, sagittal, (rays.valid | kept).all(-1) & (exist[0] | exist[1])
 
 
@@ -265,7 +266,7 @@ def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
 
 
 def _height(lens: Lens, fields: Tensor, along: Tensor, *, from_axis: bool = False) -> tuple[Tensor, Tensor]:
-    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted.
+    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are only vignetted.
 
     They count from the vertex of the sensor. Where the axis bends: along the image of the meridian close to it, turned
     to the side of the field; from_axis: from the image of the axis in each wavelength.
@@ -290,11 +291,11 @@ def _meridian(fields: Tensor) -> Tensor:
     return torch.stack([safe_divide(side * x, length), safe_divide(side * y, length)])
 
 
-def relative_error(height, ideal):
+def relative_error(height: Number, ideal: Number) -> Number:
     """height/ideal - 1 of tensors or dual numbers: distortion."""
     return divide(height - ideal, ideal)
 
 
-def focus_of_close_rays(apart, opening):
+def focus_of_close_rays(apart: Number, opening: Number) -> Number:
     """mm from the sensor to where two close rays meet, -Δx/Δm, m = (L, M)/N, along one section; of any number type."""
     return -divide(apart, opening)

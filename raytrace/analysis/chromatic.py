@@ -8,7 +8,7 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import value
-from raytrace.plotting.style import FAINT, GREY, INK, array, number_text, styled, wavelength_colours
+from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, number_text, styled, wavelength_colours
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import side_behind
@@ -38,9 +38,9 @@ class ChromaticFocalShift(Analysis):
         return {"largest_shift": float(extent), "depth_of_focus": float(self.depth_of_focus)}
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """The focus over wavelength, drawn sideways, between the limits of a quarter wave."""
-        _, panel = chart(4.2, 4.4, "paraxial focus, from that of the primary wavelength (mm)", "wavelength (µm)")
+        panel = chart(4.2, 4.4, "paraxial focus, from that of the primary wavelength (mm)", "wavelength (µm)")
         places, shift, depth = array(self.wavelength), array(self.shift), float(self.depth_of_focus)
         limits = f"±{1e3 * depth:.3g} µm: λ/4 of wavefront"
         panel.axvspan(-depth, depth, color=FAINT, alpha=0.45, linewidth=0, label=limits)

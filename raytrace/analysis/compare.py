@@ -3,8 +3,8 @@
 import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch import Tensor
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
 from raytrace.maths.sampling import Grid, grid
-from raytrace.plotting.style import array, styled
+from raytrace.plotting.style import Figure, array, styled
 from raytrace.psf_models.figures import brightness, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
@@ -46,14 +46,14 @@ _WHOLE = ("parameters", "rays")
 
 @value
 class Abilities(Result):
-    """What each model can represent: one number (M,) for each model and question, of the object in focus.
+    """The properties that each model can represent, of the object in focus: one number (M,) for each model.
 
     conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
     anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
         asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
         light (off axis).
-    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan where there is none (diffraction).
-    parameters: how many curvatures, conics and thicknesses move the kernel: have a derivative other than 0.
+    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan without a minimum (diffraction).
+    parameters: number of curvatures, conics and thicknesses by which the kernel has a derivative other than 0.
     rays: traced for one kernel on the axis.
     """
 
@@ -88,7 +88,7 @@ class Comparison(Result):
 
     psfs: of each model, kernels (D, 1, rows, columns); models: their names.
     object_distances: (D,) mm; sensor_distance: () mm from the last surface; wavelength: () µm.
-    abilities: what each model can represent, if that was asked.
+    abilities: the properties that each model can represent, or None.
     """
 
     psfs: tuple[Psf, ...]
@@ -104,29 +104,29 @@ class Comparison(Result):
 
         Of "Fourier" and "wave" of the light inside the window, see `Psf.covariance`.
         """
-        covariance = torch.stack([one.covariance[..., 0] for one in self.psfs])
+        covariance = torch.stack([psfs.covariance[..., 0] for psfs in self.psfs])
         return safe_sqrt(0.5 * (covariance[:, 0] + covariance[:, 2]))
 
     @property
     def difference(self) -> Tensor:
         """Relative L1 difference (M, D) of each kernel from that of the last model."""
-        kernels = torch.stack([one.kernel[:, 0] for one in self.psfs])
+        kernels = torch.stack([psfs.kernel[:, 0] for psfs in self.psfs])
         return safe_divide((kernels - kernels[-1]).abs().sum((-2, -1)), kernels[-1].sum((-2, -1)))
 
     @property
     def error(self) -> Tensor:
         """Estimated error (M, D) of each kernel against its own model's limit, see `Psf.error`."""
-        return torch.stack([one.error[:, 0] for one in self.psfs])
+        return torch.stack([psfs.error[:, 0] for psfs in self.psfs])
 
     def columns(self) -> dict[str, Tensor]:
         return {
             "model": axis(torch.arange(len(self.models), device=self.object_distances.device), 0, 2),
             "object_distance": axis(self.object_distances, 1, 2),
             "sigma_um": 1e3 * self.sigma,
-            "energy": torch.stack([one.energy[:, 0] for one in self.psfs]),
+            "energy": torch.stack([psfs.energy[:, 0] for psfs in self.psfs]),
             "difference": self.difference,
             "error": self.error,
-            "rays": axis(self.object_distances.new_tensor([one.rays for one in self.psfs]), 0, 2),
+            "rays": axis(self.object_distances.new_tensor([psfs.rays for psfs in self.psfs]), 0, 2),
         }
 
     def words(self) -> dict:
@@ -159,7 +159,7 @@ class Comparison(Result):
             f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {self.models[-1]}, "
             "estimated error of the kernel (Gaussian DRT: of σ), for objects at",
         ]
-        columns = {Column("model", form="<"): self.models}
+        columns: dict[str | Column, Tensor | Sequence] = {Column("model", form="<"): self.models}
         table = self.columns()
         for k, distance in enumerate(self.object_distances.tolist()):
             columns |= {
@@ -170,23 +170,23 @@ class Comparison(Result):
         return [Table(columns, title, [] if self.abilities is None else [str(self.abilities)])]
 
     @styled
-    def draw(self, *, log: bool = False):
+    def draw(self, *, log: bool = False) -> Figure:
         """Kernels over object distance (columns) and model (rows, with the number of its rays).
 
         Below each kernel: its energy inside the window, and its relative L1 difference from the last row.
         log: four decades of brightness below the peak.
         """
-        kernels = [array(one.kernel)[:, 0] for one in self.psfs]
+        kernels = [array(psfs.kernel)[:, 0] for psfs in self.psfs]
         notes = [
             [
-                f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if one is not kernels[-1] else "")
-                for k, d in zip(one, row, strict=True)
+                f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if models is not kernels[-1] else "")
+                for k, d in zip(models, row, strict=True)
             ]
-            for one, row in zip(kernels, array(self.difference), strict=True)
+            for models, row in zip(kernels, array(self.difference), strict=True)
         ]
         labels = [
-            f"{name}\n" + (f"({one.rays} rays)" if one.rays else "")
-            for name, one in zip(self.models, self.psfs, strict=True)
+            f"{name}\n" + (f"({psfs.rays} rays)" if psfs.rays else "")
+            for name, psfs in zip(self.models, self.psfs, strict=True)
         ]
         grid = self.psfs[-1].grid
         pitch, distances = float(grid.pitch), self.object_distances.tolist()
@@ -228,8 +228,8 @@ def compare(
     pixels = grid(lens.wavelengths.new_tensor(pixel), size)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)  # the estimated errors are part of the result
-        found = side_by_side(lens, distances, pixels=pixels)
-        return dataclasses.replace(found, abilities=abilities(lens, pixels=pixels))
+        kernels = side_by_side(lens, distances, pixels=pixels)
+        return dataclasses.replace(kernels, abilities=abilities(lens, pixels=pixels))
 
 
 def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tensor, start: str = "paraxial") -> Lens:
@@ -281,13 +281,13 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
     return Abilities(**table, models=tuple(model.title for model in _ROWS))
 
 
-def _psf(lens: Lens, model: Model, /, **options) -> Psf:
+def _psf(lens: Lens, model: Model, /, **options: Any) -> Psf:
     """Kernels as `psf` gives them; on the axis and at the lens's object distance by default."""
     return psf(lens, **{"model": model.name, "fields": lens.wavelengths.new_zeros(2, 1), **options})
 
 
-def _relative(one: Tensor, other: Tensor) -> Tensor:
-    return safe_divide((one - other).abs().sum(), other.sum())
+def _relative(kernel: Tensor, other: Tensor) -> Tensor:
+    return safe_divide((kernel - other).abs().sum(), other.sum())
 
 
 def _anisotropy(covariance: Tensor) -> float:
@@ -299,12 +299,12 @@ def _anisotropy(covariance: Tensor) -> float:
 def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid:
     """The pixels about the centroid of the light of a field (2, 1), as the least model that traces, or not, has it."""
     least = next(other for other in MODELS.values() if other.traces == model.traces)
-    found = _psf(lens, least, fields=fields, grid=pixels, **least.compared)
-    return dataclasses.replace(found.grid, centre=found.centroid[:, 0, 0].detach())
+    psfs = _psf(lens, least, fields=fields, grid=pixels, **least.compared)
+    return dataclasses.replace(psfs.grid, centre=psfs.centroid[:, 0, 0].detach())
 
 
 def _most_curved(lens: Lens) -> int:
-    """Number of the most curved surface that bends light: the image may be curved, and so may dummies."""
+    """Number of the most curved refracting or reflecting surface: the image and dummy surfaces may be curved, too."""
     indices = media(lens, lens.primary)
     strength = {
         k: abs(float(surface.curvature))
@@ -313,10 +313,10 @@ def _most_curved(lens: Lens) -> int:
     }
     if not strength:
         raise ValueError(
-            "the comparison of PSF models changes a conic, but no surface of this lens that bends light is curved; "
-            "ask for kernels of one model by `psf`"
+            "the comparison of PSF models changes a conic, but no refracting or reflecting surface of this lens is "
+            "curved; ask for kernels of one model by `psf`"
         )
-    return max(strength, key=strength.get)
+    return max(strength, key=strength.__getitem__)
 
 
 def _with_conic(lens: Lens) -> Lens:
@@ -325,13 +325,13 @@ def _with_conic(lens: Lens) -> Lens:
     return lens.replace(k, conic=_CONIC if conic is None else conic + _CONIC)
 
 
-def _dark_ring(lens: Lens, model: Model, work: dict) -> float:
+def _dark_ring(lens: Lens, model: Model, work: Mapping[str, Any]) -> float:
     """First minimum along x of the kernel of the slowed lens, below a twentieth of the peak; nan without one."""
     slow = torch.clamp(first_order(lens).f_number, min=_SLOW)
     slowed = dataclasses.replace(lens, aperture=SystemAperture("image_f_number", slow))
     airy = 1.2197e-3 * lens.wavelengths[0] * first_order(slowed).paraxial_working_f_number
-    line = _psf(slowed, model, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)), **work)
-    line = line.kernel[0, 0, 0, 2 * _AIRY_PIXELS :].tolist()
+    psfs = _psf(slowed, model, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)), **work)
+    line = psfs.kernel[0, 0, 0, 2 * _AIRY_PIXELS :].tolist()
     for i in range(1, len(line) - 1):
         a, b, c = line[i - 1 : i + 2]
         # A geometric kernel falls to 0 and stays there; a ring rises again.
@@ -340,11 +340,11 @@ def _dark_ring(lens: Lens, model: Model, work: dict) -> float:
     return math.nan
 
 
-def _parameters(lens: Lens, model: Model, work: dict) -> int:
-    """How many numbers of the lens move the kernel on a sensor 8 λN² behind its own, where no model has a point."""
-    surfaces, numbers = list(lens.surfaces), []
+def _parameters(lens: Lens, model: Model, work: Mapping[str, Any]) -> int:
+    """Number of variables of the lens that change the kernel on a sensor 8 λN² behind its own: in no model a point."""
+    surfaces, numbers = list(lens.surfaces), list[Tensor]()
     for k, surface in enumerate(surfaces[:-1]):
-        changes = {"thickness": surface.thickness}
+        changes: dict[str, Any] = {"thickness": surface.thickness}
         if surface.curvature is not None and float(surface.curvature) != 0:
             conic = torch.zeros_like(surface.thickness) if surface.conic is None else surface.conic
             changes |= {"curvature": surface.curvature, "conic": conic}
@@ -356,6 +356,7 @@ def _parameters(lens: Lens, model: Model, work: dict) -> int:
     blur = 1e-3 * lens.wavelengths[0] * number
     lens = with_sensor_distance(lens, surfaces[-2].thickness + 8 * blur * number)
     work = {**work, "tol": 0.05} if "tol" in work else work
-    found = _psf(lens, model, grid=grid(2 * blur, 5), **work)
-    gradients = torch.autograd.grad(found.kernel.square().sum(), numbers, allow_unused=True)
-    return sum(gradient is not None and math.isfinite(gradient) and float(gradient) != 0 for gradient in gradients)
+    psfs = _psf(lens, model, grid=grid(2 * blur, 5), **work)
+    gradients = torch.autograd.grad(psfs.kernel.square().sum(), numbers, allow_unused=True)
+    slopes = [float(gradient) for gradient in gradients if gradient is not None]
+    return sum(math.isfinite(slope) and slope != 0 for slope in slopes)

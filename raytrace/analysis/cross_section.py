@@ -16,6 +16,7 @@ from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens, media
+from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_posed, sag_at
 from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
@@ -23,9 +24,12 @@ from raytrace.tracing.trace import lens_steps, points_on_surfaces
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
 
+#: Points (right, up) of a closed line in the picture, mm.
+Outline = tuple[np.ndarray, np.ndarray]
+
 GLASSY = 1.01  # an index above which a medium is drawn as glass
 
-#: What goes upward in a view, by its number among x, y and z; z goes to the right.
+#: The coordinate that points upward in a view, by its number among x, y and z; z points to the right.
 UPWARD = {"yz": 1, "xz": 0}
 
 
@@ -45,10 +49,10 @@ class RayPath(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A surface in a view: how its z and heights across it lie in the picture.
+    """A surface in a view: its vertex in the picture, and the directions of its z and of heights across it.
 
-    origin: (2,) mm of its vertex, to the right and upward; along, across: (2,) what one of z and one of height move;
-    direction: cosines (2,) along x and y of the surface in which heights are taken.
+    origin: (2,) mm of its vertex, to the right and upward; along, across: (2,) the step in the picture of 1 mm of z and
+    of 1 mm of height; direction: cosines (2,) along x and y of the surface in which heights are taken.
     """
 
     origin: np.ndarray
@@ -58,7 +62,8 @@ class Section(NamedTuple):
 
     def at(self, z: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points of the picture (…) at depths z and heights (…) mm."""
-        return tuple(self.origin[i] + z * self.along[i] + height * self.across[i] for i in (0, 1))
+        right, up = (self.origin[i] + z * self.along[i] + height * self.across[i] for i in (0, 1))
+        return right, up
 
     def height(self, right: np.ndarray, up: np.ndarray) -> np.ndarray:
         """How high above its vertex, across the surface, a point of the picture is."""
@@ -68,7 +73,7 @@ class Section(NamedTuple):
 def sections(lens: Lens, view: str = "yz") -> list[Section]:
     """Every surface in a view. Raises ValueError for a thickness that is not finite, but for the object's."""
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
-        if not math.isfinite(surface.thickness):
+        if not math.isfinite(float(surface.thickness)):
             raise ValueError(f"surface {k} has a thickness of {float(surface.thickness)}: nothing to draw")
     return [_section(frame, view) for frame in frames(lens)]
 
@@ -102,17 +107,18 @@ def sides(lens: Lens) -> list[int]:
 
 def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
     """Sag (...) mm at a radius (...) mm, of either sign, along a direction by its cosines in x and y."""
-    radius = torch.as_tensor(radius, dtype=surface.thickness.dtype, device=surface.thickness.device)
-    return array(sag_at(surface, direction[0] * radius, direction[1] * radius))
+    r = torch.as_tensor(radius, dtype=surface.thickness.dtype, device=surface.thickness.device)
+    return array(sag_at(surface, direction[0] * r, direction[1] * r))
 
 
 def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
-    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone, where
-    it is smaller than the surface."""
+    """Centre (x, y) and radius in mm of the drawn part of a surface: a decentred aperture that is smaller than the
+    surface, else the whole."""
     for aperture in surface.apertures:
         rim = reach(aperture)[1]
         if not aperture.obscures and rim < radius and any(aperture.centre):
-            return *aperture.centre, rim
+            x, y = aperture.centre
+            return float(x), float(y), rim
     return 0.0, 0.0, radius
 
 
@@ -140,7 +146,7 @@ def heights(*radii: float) -> np.ndarray:
 def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor, stop: float | None = None) -> list[float]:
     """Radius in mm to which every surface is drawn.
 
-    The file's semi-diameter; where it has none, what the rays of all fields need and 4 % more; wavelength: () or (W,);
+    The semi-diameter of the file, else 4 % more than the rays of all fields reach; wavelength: () or (W,);
     stop: the radius of the stop, where it is known.
     """
     stored = [surface.semi_diameter or 0.0 for surface in lens.surfaces]
@@ -164,34 +170,35 @@ def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor, stop: float | No
     ]
 
 
-def glass(lens: Lens, number: int, places: list[Section], radii: list[float], indices: list[float]):
-    """Outline (right, up) in the picture of the glass behind a surface; None where there is none to be seen."""
+def glass(lens: Lens, number: int, places: list[Section], radii: list[float], indices: list[float]) -> Outline | None:
+    """Outline in the picture of the glass behind a surface; None where the glass has no thickness."""
     back = partner(lens, number)
-    here, there = places[number], places[back]
-    within = here.along @ (there.origin - here.origin), here.across @ (there.origin - here.origin)
-    upright = abs(within[1]) < 1e-9 and np.allclose(here.across, there.across, atol=1e-9)
+    front, behind = places[number], places[back]
+    within = front.along @ (behind.origin - front.origin), front.across @ (behind.origin - front.origin)
+    upright = abs(within[1]) < 1e-9 and np.allclose(front.across, behind.across, atol=1e-9)
     pair = lens.surfaces[number], lens.surfaces[back]
     if not upright:
-        return _wedge(pair, (here, there), (radii[number], radii[back]))
+        return _wedge(pair, (front, behind), (radii[number], radii[back]))
     if within[0] == 0:
         return None
     if back + 1 == len(lens.surfaces):  # glass up to the image, which has no rim of its own
-        outline = element(*pair, 0.0, within[0], (radii[number],) * 2, (False, False), here.direction)
+        outline = element(*pair, 0.0, within[0], (radii[number],) * 2, (False, False), front.direction)
     else:
         glassy = indices[number - 1] > GLASSY, indices[back] > GLASSY
         cemented = glassy[0] and not pair[0].is_mirror, back + 1 < len(lens.surfaces) and glassy[1]
-        outline = element(*pair, 0.0, within[0], (radii[number], radii[back]), cemented, here.direction)
-    return here.at(*outline)
+        outline = element(*pair, 0.0, within[0], (radii[number], radii[back]), cemented, front.direction)
+    return front.at(*outline)
 
 
-def _wedge(pair: tuple[Surface, Surface], places: tuple[Section, Section], radii: tuple[float, float]):
-    """The outline of glass between two surfaces that are tilted to each other: each to its own rim."""
+def _wedge(pair: tuple[Surface, Surface], places: tuple[Section, Section], radii: tuple[float, float]) -> Outline:
+    """The outline of glass between two surfaces that are tilted to each other, each drawn to its rim."""
     profiles = []
     for surface, place, radius in zip(pair, places, radii, strict=True):
         height = heights(radius)
         profiles.append(place.at(depth(surface, height, place.direction), height))
     turned = -1 if places[0].across @ places[1].across < 0 else 1
-    return tuple(np.concatenate([front, back[::-turned]]) for front, back in zip(*profiles, strict=True))
+    right, up = (np.concatenate([front, back[::-turned]]) for front, back in zip(*profiles, strict=True))
+    return right, up
 
 
 def element(
@@ -202,11 +209,11 @@ def element(
     radii: tuple[float, float],
     cemented: tuple[bool, bool],
     direction: tuple[float, float] = (0.0, 1.0),
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Outline:
     """Outline (z, y) of the glass between two surfaces, each drawn to its own radius.
 
-    The smaller surface is carried on to the rim of the larger: flat, as it is ground, or along its own sag where it is
-    cemented or where a flat would cut the other surface; where nothing fits, the rim is where the two surfaces meet.
+    The smaller surface continues to the rim of the larger: flat, as it is ground, or along its sag where it is cemented
+    or where a flat would cut the other surface; otherwise the rim is where the two surfaces meet.
     """
     rim = max(radii)
     y = heights(*radii)
@@ -214,8 +221,8 @@ def element(
     outlines = []
     for along_sag in (cemented, (True, True), (False, True), (True, False), (False, False)):
         z = []
-        for surface, vertex, radius, own in zip((front, back), (z_front, z_back), radii, along_sag, strict=True):
-            reach = min(rim, edge_radius(surface)) if own else radius
+        for surface, vertex, radius, continued in zip((front, back), (z_front, z_back), radii, along_sag, strict=True):
+            reach = min(rim, edge_radius(surface)) if continued else radius
             z.append(vertex + depth(surface, np.clip(y, -reach, reach), direction))
         gap = forward * (z[1] - z[0])
         if (gap >= 0).all():
@@ -233,12 +240,12 @@ def ray_paths(
 ) -> list[list[RayPath]]:
     """The paths of every field's rays, from the plane z_start (mm) or the object, whichever is nearer.
 
-    A path ends at the image or at the surface where the ray is lost: a vignetted or totally reflected one at its hit,
-    one that misses in the surface's vertex plane. Surfaces that do not bend light are no corners of a path.
+    A path ends at the image or at the surface where the ray fails or is vignetted: a ray that misses a surface in the
+    plane of its vertex, another ray at its hit. Surfaces that do not deflect light are no corners of a path.
     """
     corners, endings, ends = _corners(lens, pupil, fields, wavelength, z_start)
     bends, seen = _bends(lens, wavelength), [2, UPWARD[view]]
-    paths = []
+    paths: list[list[RayPath]] = []
     for f, row in enumerate(endings):
         paths.append([])
         for p, (status, last) in enumerate(row):
@@ -248,7 +255,8 @@ def ray_paths(
             points = np.array(
                 [*(corners[k][:, f, p] for k in numbers[:-1]), ends.get((f, p), corners[last][:, f, p])]
             ).T
-            paths[f].append(RayPath(*points[seen], status, last, numbers, points))
+            z, y = points[seen]
+            paths[f].append(RayPath(z, y, status, last, numbers, points))
     return paths
 
 
@@ -262,8 +270,10 @@ def _bends(lens: Lens, wavelength: Tensor) -> list[int]:
     ]
 
 
-def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_start: float):
-    """Where rays meet every surface, each (3, F, P) mm; how each of them ends, and where if it is lost."""
+def _corners(
+    lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_start: float
+) -> tuple[list[np.ndarray], list[list[tuple[str, int]]], dict[tuple[int, int], np.ndarray]]:
+    """Where rays meet every surface, each (3, F, P) mm; status and last surface of each ray; the ends of lost rays."""
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelength.reshape(1))
     placed, corners, alive = frames(lens), [_start(lens, rays, z_start)], rays.valid
     points = points_on_surfaces(lens, rays, wavelength)
@@ -286,24 +296,24 @@ def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_st
             hit, _ = intersect(lens.surfaces[k], *arrival)
             at_plane = arrival[0] - arrival[1] * (arrival[0][2] / arrival[1][2])
             here = torch.where(crossing.missed, at_plane, hit)
-        here = array(frame.outside(here))[:, :, 0, :]
+        met = array(frame.outside(here))[:, :, 0, :]
         for status, lost in (
             ("miss", crossing.missed),
             ("tir", crossing.totally_reflected),
             ("vignetted", crossing.clipped),
         ):
             for f, p in np.argwhere(array(alive & lost)[:, 0]):
-                endings[f][p], ends[f, p] = (status, k), here[:, f, p]
+                endings[f][p], ends[f, p] = (status, k), met[:, f, p]
         alive = crossing.rays.valid
         position, direction = frame.outside(crossing.rays.position), frame.along(crossing.rays.direction)
-        corners.append(here)
+        corners.append(met)
     for f, p in np.argwhere(array(alive)[:, 0]):
         endings[f][p] = ("ok", len(lens.surfaces) - 1)
     return corners, endings, ends
 
 
-def _start(lens: Lens, rays, z_start: float) -> np.ndarray:
-    """Points (3, F, P) mm where rays enter the picture: in the plane z_start, or on the object in front of nothing."""
+def _start(lens: Lens, rays: Rays, z_start: float) -> np.ndarray:
+    """Points (3, F, P) mm where rays enter the picture: in the plane z_start, or on the object if it is nearer."""
     distance = float(lens.surfaces[0].thickness)
     position, direction = rays.position, rays.direction
     if math.isfinite(distance) and -distance >= z_start:

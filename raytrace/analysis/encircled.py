@@ -19,7 +19,7 @@ from raytrace.analysis.setting import (
 )
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.plotting.style import GREY, array, styled
+from raytrace.plotting.style import GREY, Figure, array, styled
 from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector
 from raytrace.tracing.f_number import axial_f_number
@@ -35,7 +35,7 @@ _RINGS_PER_STEP = 16
 class EncircledEnergy(Analysis):
     """Share (F, K) of the light that reaches the sensor within radii (K,) mm of the centroid (2, F) mm of the rays.
 
-    fields: (2, F); geometric: of rays, without diffraction; marked: whether the radii were asked for, and are marked on
+    fields: (2, F); geometric: of rays, without diffraction; marked: whether the radii were specified, and are marked on
     the curves.
     """
 
@@ -57,10 +57,10 @@ class EncircledEnergy(Analysis):
         return _encircled(self.lens, self.fields, fine(self.radii), self.geometric)
 
     @styled
-    def draw(self):
-        """Share of the light over the radius about the centroid. Radii that were asked for are marked."""
+    def draw(self) -> Figure:
+        """Share of the light over the radius about the centroid. Specified radii are marked."""
         curves = self.drawn()
-        _, panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
+        panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
         radii = 1e3 * array(curves.radii)
         by_field(panel, curves, radii, share=array(curves.share))
         if self.marked:
@@ -131,7 +131,7 @@ def _rays_of(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _of_rays(distance: Tensor, energy: Tensor, radii: Tensor) -> Tensor:
-    """Half of a ray's light counts at its own distance; the curve is linear in between, and starts at 0."""
+    """Half of the light of a ray counts at its distance; the curve is linear in between, and starts at 0."""
     distance, order = torch.where(energy > 0, distance, distance.max()).sort(-1)
     energy = torch.gather(energy, -1, order)
     half = energy.cumsum(-1) - 0.5 * energy

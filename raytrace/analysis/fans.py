@@ -12,12 +12,12 @@ from raytrace.analysis.setting import Numbers, Points, like, primary_wavelength,
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, masked
 from raytrace.maths.sampling import fan as pupil_fan
-from raytrace.plotting.style import GREY, array, new_figure, styled
+from raytrace.plotting.style import GREY, Figure, array, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.spot import chief_arrives, image_rays
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 
-#: Whose sphere an OPD is measured on.
+#: Wavelengths whose chief ray centres the reference sphere of an OPD.
 REFERENCES = ("primary", "own")
 _UNIT = {"ray": "mm", "opd": "waves"}
 
@@ -52,7 +52,7 @@ class Fan(Analysis):
         return {**heads, "tangential": tangential, "sagittal": sagittal}
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """A row for each field: the tangential fan on the left, the sagittal one on the right, one scale for all."""
         labels, ray = field_labels(self), self.quantity == "ray"
         figure = new_figure(6.6, 1.45 * len(labels) + 1.1)
@@ -90,13 +90,13 @@ def ray_fan_of(lens: Lens, fields: Tensor, points: int) -> Fan:
     primary wavelength takes its place."""
     pupil = _pupil(lens, points)
     rays = image_rays(lens, torch.cat([torch.zeros_like(pupil[:, :1]), pupil], 1), fields=fields)
-    at, valid = rays.position[:2], rays.valid
+    hits, valid = rays.position[:2], rays.valid
     primary = slice(lens.primary_wavelength - 1, lens.primary_wavelength)
     lit = valid[:, primary]
-    total = torch.where(lit, at[:, :, primary], 0.0).sum(-1)
+    total = torch.where(lit, hits[:, :, primary], 0.0).sum(-1)
     arrives = chief_arrives(lens, rays, fields, lens.wavelengths)[:, primary]
-    centre = torch.where(arrives, at[:, :, primary, 0], safe_divide(total, lit.sum(-1).to(total.dtype)))
-    x, y = (at - centre[..., None])[..., 1:]
+    centre = torch.where(arrives, hits[:, :, primary, 0], safe_divide(total, lit.sum(-1).to(total.dtype)))
+    x, y = (hits - centre[..., None])[..., 1:]
     return _fan(lens, fields, pupil, valid[..., 1:], y, x, "ray")
 
 

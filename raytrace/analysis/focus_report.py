@@ -2,9 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict, cast
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.focus import (
+    Conjugates,
     along_normal,
     focus_moments,
     focus_of_mean_radius,
@@ -61,7 +62,7 @@ _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial fo
 
 
 class NoFocus(RaytraceError, ValueError):
-    """The light of an object has no focus; the message says why and what helps."""
+    """The light of an object has no focus; the message has the cause and a remedy."""
 
 
 class VirtualImage(RaytraceWarning):
@@ -171,12 +172,12 @@ class Focus(Result):
     def _sensors(self) -> list[tuple[str, Tensor]]:
         """Sensor distances with their names."""
         several = len(self.object_distances) > 1
-        named = [f"paraxial image of {_words(d)}" if several else "paraxial" for d in self.object_distances.tolist()]
+        names = [f"paraxial image of {_words(d)}" if several else "paraxial" for d in self.object_distances.tolist()]
         both = [("before", self.before.surfaces[-2].thickness), ("after", self.sensor_distance)]
-        return [*both, *zip(named, self.paraxial, strict=True), ("best RMS", self.rms)]
+        return [*both, *zip(names, self.paraxial, strict=True), ("best RMS", self.rms)]
 
     @style.styled
-    def draw(self, by: str | None = None):
+    def draw(self, by: str | None = None) -> style.Figure:
         """One page: the lens, the RMS spot radius through focus, and the spots before and after on one scale.
 
         Every object distance and field is a curve and a pair of spots. by: instead the curves alone, as for
@@ -188,16 +189,15 @@ class Focus(Result):
         lens, fields, wavelengths = lens_before, self.fields.detach(), self.wavelengths.detach()
         distances = self.object_distances.tolist()
         labels = _labels(lens, distances, fields)
-        rule = {
-            "fields": fields, "wavelengths": wavelengths, "wavelength_weights": self.wavelength_weights,
-            "pupil": self.pupil,
-        }  # fmt: skip
+        light = _Light(
+            fields=fields, wavelengths=wavelengths, wavelength_weights=self.wavelength_weights, pupil=self.pupil
+        )
 
         columns = max(len(labels), 1)
         figure = style.new_figure(10.0 if columns > 3 else 9.0, 8.4)
         name = style.fill(lens.name, figure.get_figwidth(), 12, bold=True) or "Lens"
         figure.suptitle(name, fontsize=12, fontweight="bold")
-        top, bottom = figure.subfigures(2, 1, height_ratios=(1.0, 1.0), hspace=0.02)
+        top, bottom = cast(np.ndarray, figure.subfigures(2, 1, height_ratios=(1.0, 1.0), hspace=0.02))
         wide = min(1.0 + 0.32 * (columns - 1), 1.6)
         left, right = bottom.subfigures(1, 2, width_ratios=(1.25, wide), wspace=0.02)
 
@@ -206,13 +206,13 @@ class Focus(Result):
         draw_layout(axes, drawn, fields=fields, wavelengths=wavelengths[:1], rays=11 if fields.shape[1] == 1 else 7)
         top.suptitle(first_order_text(drawn), fontsize=8.5, color=style.GREY)
 
-        _draw_focus(left.add_subplot(), lens_before, lens_after, distances, labels, rule)
+        _draw_focus(left.add_subplot(), lens_before, lens_after, distances, labels, light)
         left.legend(
             loc="outside lower center", ncols=1 if columns == 1 else 2, fontsize=7.5, handlelength=1.8,
             columnspacing=1.2,
             title=None if len(labels) == 1 else "least RMS radius of every curve", title_fontsize=7.5,
         )  # fmt: skip
-        _draw_spots(right, lens_before, lens_after, distances, labels, rule)
+        _draw_spots(right, lens_before, lens_after, distances, labels, light)
         return figure
 
     def save(self, path: str | PathLike) -> None:
@@ -253,33 +253,45 @@ def focus(
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
     warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness
-    at, weights = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    pupil, weights = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)
-    scene = {
-        "object_distances": distances,
-        "fields": fields,
-        "wavelengths": wavelengths,
-        "distance_weights": _weights(lens, distance_weights, len(distances), option("distance_weights")),
-        "field_weights": _weights(lens, field_weights, fields.shape[1], option("field_weights")),
-        "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), option("wavelength_weights")),
-        "rings": (rings or SAMPLINGS["gauss"][2]) if sampling == "gauss" else None,
-    }
+    shares = _weights(lens, distance_weights, len(distances), option("distance_weights"))
+    scene = Conjugates(
+        object_distances=distances,
+        fields=fields,
+        wavelengths=wavelengths,
+        distance_weights=shares,
+        field_weights=_weights(lens, field_weights, fields.shape[1], option("field_weights")),
+        wavelength_weights=_weights(lens, wavelength_weights, len(wavelengths), option("wavelength_weights")),
+        rings=(rings or SAMPLINGS["gauss"][2]) if sampling == "gauss" else None,
+    )
     if not bool(torch.isfinite(paraxial).all()):
         raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
-    rms = focus_of_rms(lens, at, weights, **scene)
-    _check_rays(lens, at, distances, fields, wavelengths)
+    rms = focus_of_rms(lens, pupil, weights, **scene)
+    _check_rays(lens, pupil, distances, fields, wavelengths)
     if not bool(torch.isfinite(rms)):
         raise NoFocus(f"one ray, or parallel rays, have no focus; give more {option('rings')} or {option('points')}")
     best = rms
     if criterion == "mean":
-        best = focus_of_mean_radius(lens, at, weights, **scene)
+        best = focus_of_mean_radius(lens, pupil, weights, **scene)
     elif criterion == "paraxial":
-        shares = scene["distance_weights"]
         best = paraxial.mean() if shares is None else (shares * paraxial).sum() / shares.sum()
     result = Focus(
-        with_sensor_distance(lens, best), lens, paraxial, rms, points=at, weights=weights, criterion=criterion,
-        **scene,
-    )  # fmt: skip
+        lens=with_sensor_distance(lens, best),
+        before=lens,
+        paraxial=paraxial,
+        rms=rms,
+        object_distances=distances,
+        fields=fields,
+        wavelengths=wavelengths,
+        distance_weights=shares,
+        field_weights=scene["field_weights"],
+        wavelength_weights=scene["wavelength_weights"],
+        points=pupil,
+        weights=weights,
+        rings=scene["rings"],
+        criterion=criterion,
+    )
     if not result.is_real:
         message = (
             f"the image is virtual, at {float(best):g} mm, on the side of the last surface that the light comes from"
@@ -288,7 +300,7 @@ def focus(
     return result
 
 
-def _weights(lens: Lens, weights, count: int, name: str) -> Tensor | None:
+def _weights(lens: Lens, weights: Sequence[float] | Tensor | None, count: int, name: str) -> Tensor | None:
     if weights is None:
         return None
     weights = vector(weights, like=lens)
@@ -304,8 +316,8 @@ def _check_rays(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, w
         trial = with_object_distance(lens, distance)
         with torch.no_grad():
             valid = image_rays(trial, points, fields=fields, wavelengths=wavelengths).valid
-        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
-        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
+        prefix = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, prefix=prefix)
         arrived.append(valid.double().mean())
     lost = 1 - float(sum(arrived)) / len(arrived)
     if lost == 1:
@@ -321,16 +333,27 @@ def _words(distance: float) -> str:
 
 def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
     """Labels of the curves, object distance outermost."""
-    points = [field_label(lens, point) for point in style.array(fields).T]
+    points = [field_label(lens, point) for point in style.array(fields).T.tolist()]
     if len(distances) == 1:
         return points
     objects = [object_text(distance) for distance in distances]
     return [place if len(points) == 1 else f"{place}, {point}" for place in objects for point in points]
 
 
-def _draw_focus(axes, before: Lens, after: Lens, distances: list[float], labels: list[str], rule: dict) -> None:
+class _Light(TypedDict):
+    """Options of `focus_rays` and `field_spots`."""
+
+    fields: Tensor
+    wavelengths: Tensor
+    wavelength_weights: Tensor | None
+    pupil: tuple[Tensor, Tensor] | None
+
+
+def _draw_focus(
+    axes: style.Axes, before: Lens, after: Lens, distances: list[float], labels: list[str], light: _Light
+) -> None:
     """The curves, and lines for the sensor before and after and for the paraxial focus, all with their numbers."""
-    bundles = [focus_rays(with_object_distance(before, distance), **rule) for distance in distances]
+    bundles = [focus_rays(with_object_distance(before, distance), **light) for distance in distances]
     most = max(bundle.weights.shape[-1] for bundle in bundles)  # rays of clear pupils differ in number
 
     def joined(parts: Sequence[Tensor], dim: int) -> Tensor:
@@ -366,21 +389,23 @@ def _draw_focus(axes, before: Lens, after: Lens, distances: list[float], labels:
     axes.set_title("RMS spot radius through focus", fontweight="bold", pad=8)
 
 
-def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels: list[str], rule: dict) -> None:
+def _draw_spots(
+    page: style.SubFigure, before: Lens, after: Lens, distances: list[float], labels: list[str], light: _Light
+) -> None:
     """Spots before and after, the same scale in all panels; one column a curve, or side by side for one curve."""
     panels = []
     for lens in (before, after):
-        spots = [field_spots(with_object_distance(lens, distance), **rule) for distance in distances]
+        spots = [field_spots(with_object_distance(lens, distance), **light) for distance in distances]
         panels.append([(*pair, f) for pair in spots for f in range(pair[0].rays.shape[0])][:_MOST_SPOTS])
     airy = float(airy_radius(with_object_distance(after, distances[0])))
-    wavelengths = style.array(rule["wavelengths"])
+    wavelengths = light["wavelengths"].tolist()
     half = panel_size([float(spot.geometric_radius[f]) for row in panels for spot, _, f in row], airy)
     count = len(panels[0])
     axes = page.subplots(*((1, 2) if count == 1 else (2, count)), squeeze=False).reshape(2, count)
     for row, when in enumerate(("before", "after")):
         for column, (whole, dots, f) in enumerate(panels[row]):
-            panel, look = axes[row, column], {"wavelengths": wavelengths, "airy": airy}
-            draw_spot_to_scale(panel, whole, dots, f, half=half, **look)
+            panel = axes[row, column]
+            draw_spot_to_scale(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
             if count == 1:
                 panel.set_title(f"Spot {when}", fontweight="bold", pad=8)
             else:
@@ -415,12 +440,12 @@ class FocusRays(NamedTuple):
 
     def radii(self, shifts: np.ndarray) -> np.ndarray:
         """RMS radii (S, C) mm on the sensor moved by shifts (S,) mm."""
-        shifts = torch.as_tensor(shifts, dtype=self.weights.dtype, device=self.weights.device)
-        return style.array(through_focus(self.rays, self.slant * shifts, self.weights).rms_radius)
+        moves = self.slant * torch.as_tensor(shifts, dtype=self.weights.dtype, device=self.weights.device)
+        return style.array(through_focus(self.rays, moves, self.weights).rms_radius)
 
 
 @style.styled
-def through_focus_curve(found: Focus, by: str = "field"):
+def through_focus_curve(focus: Focus, by: str = "field") -> style.Figure:
     """RMS spot radius against the sensor distance; minima, the paraxial focus and the sensor before are marked.
 
     by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
@@ -428,20 +453,21 @@ def through_focus_curve(found: Focus, by: str = "field"):
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
-    lens = with_object_distance(detached(found.before), found.object_distances[0].detach())
-    fields, values = found.fields.detach(), style.array(found.wavelengths)
+    lens = with_object_distance(detached(focus.before), focus.object_distances[0].detach())
+    fields, values = focus.fields.detach(), focus.wavelengths.tolist()
+    colours: Sequence
     if by == "field":
-        labels = [field_label(lens, field) for field in style.array(fields).T]
+        labels = [field_label(lens, field) for field in style.array(fields).T.tolist()]
         colours, title = style.field_colours(len(labels)), field_title(lens)
     else:
         fields, labels = fields[:, :1], [f"{wavelength:.4g} µm" for wavelength in values]
-        colours, title = style.wavelength_colours(values), f"Field {field_label(lens, style.array(fields)[:, 0])}"
+        colours, title = style.wavelength_colours(values), f"Field {field_label(lens, fields[:, 0].tolist())}"
     bundle = focus_rays(
-        lens, fields=fields, wavelengths=found.wavelengths.detach(), wavelength_weights=found.wavelength_weights,
-        pupil=found.pupil, by=by,
+        lens, fields=fields, wavelengths=focus.wavelengths.detach(), wavelength_weights=focus.wavelength_weights,
+        pupil=focus.pupil, by=by,
     )  # fmt: skip
     sensor = float(lens.surfaces[-2].thickness)
-    marks = {"paraxial focus": float(found.paraxial[0]), "sensor": sensor}
+    marks = {"paraxial focus": float(focus.paraxial[0]), "sensor": sensor}
     figure = style.new_figure(7.0, 4.4)
     axes = figure.add_subplot()
     draw_curves(axes, bundle, sensor, focus_span(lens, bundle, sensor, marks.values()), labels=labels, colours=colours)
@@ -471,11 +497,10 @@ def focus_rays(
 
     pupil: points (2, P) and weights (P,), of which the rays that arrive count, by default of the clear pupil.
     """
-    scene = {"fields": fields, "wavelengths": wavelengths}
-    points, weights = clear_pupil(lens, **scene) if pupil is None else pupil
+    points, weights = clear_pupil(lens, fields=fields, wavelengths=wavelengths) if pupil is None else pupil
     shares, slant = shares_of(lens, wavelengths, wavelength_weights), float(along_normal(lens))
     with torch.no_grad():
-        rays = image_rays(lens, points, **scene)
+        rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     if by == "wavelength":
         weights = weights.expand(rays.shape).flatten(0, 1)
         return FocusRays(
@@ -486,7 +511,7 @@ def focus_rays(
     return FocusRays(joined, weights, slant)
 
 
-def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[float, float]:
+def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks: Iterable[float]) -> tuple[float, float]:
     """First and last sensor distance in mm: all minima and marks, and room for the curves to rise around them.
 
     A perfect cone moved by s has the RMS radius s/(√8 N); the room makes that twice the least RMS radius, or five
@@ -503,14 +528,22 @@ def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[flo
     return min(seen) - room, max(seen) + room
 
 
-def draw_curves(axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, labels, colours=None) -> None:
+def draw_curves(
+    axes: style.Axes,
+    bundle: FocusRays,
+    sensor: float,
+    span: tuple[float, float],
+    *,
+    labels: Sequence[str],
+    colours: Sequence | None = None,
+) -> None:
     """One line for each batch of rays, a dot at its minimum; labels carry the place and the radius of the minimum."""
     colours = style.field_colours(len(labels)) if colours is None else colours
     shifts = np.linspace(span[0], span[1], _SAMPLES) - sensor
     radii, best = 1e3 * bundle.radii(shifts), bundle.best
     least = 1e3 * np.diagonal(bundle.radii(best))
     alive = np.isfinite(least)
-    for c in np.flatnonzero(alive):
+    for c in np.flatnonzero(alive).tolist():
         place = f"{labels[c]}: {sensor + best[c]:.4f} mm, {style.number_text(least[c])} µm"
         width = max(1.9 - 0.3 * c, 1.0)  # so that curves that coincide all show
         axes.plot(sensor + shifts, radii[:, c], color=colours[c], linewidth=width, label=place, zorder=3)
@@ -526,7 +559,7 @@ def draw_curves(axes, bundle: FocusRays, sensor: float, span: tuple[float, float
     axes.set_axisbelow(True)
 
 
-def draw_marks(axes, marks: dict[str, float]) -> None:
+def draw_marks(axes: style.Axes, marks: dict[str, float]) -> None:
     """Vertical lines with their names along the top, turned so that neighbours do not meet."""
     low, high = axes.get_xlim()
     dashes = ((0, (1, 1.5)), (0, (5, 2)), "solid", (0, (5, 2, 1, 2)))

@@ -17,7 +17,7 @@ from raytrace.analysis.setting import (
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Table, axis, masked
-from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
+from raytrace.plotting.style import GREY, Figure, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
 from raytrace.tracing.spot import chief_points
@@ -86,7 +86,7 @@ class GridDistortion(Analysis):
         return masked(100 * self.distortion, self.valid)
 
     @styled
-    def draw(self, *, exaggerate: float = 1.0):
+    def draw(self, *, exaggerate: float = 1.0) -> Figure:
         """The ideal grid in grey, the real one over it, its distortion exaggerated; of the first wavelength."""
         ideal, actual = (array(points[:, 0]) for points in (self.ideal, self.actual))
         actual = np.where(array(self.valid[0]).astype(bool), ideal + exaggerate * (actual - ideal), np.nan)
@@ -106,7 +106,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     """Distortion over `points` × `points` objects, at whose corners the largest field lies, square in tan θ or in mm.
 
     With the points (0, 0), (δ, 0) and (0, δ) close to the axis the ideal image of a field f is J f, J their differences
-    over δ, counted from the image of the axis: on the sensor as it stands, whatever its focus. wavelengths: µm, the
+    over δ, counted from the image of the axis: on the sensor at its position, in focus or not. wavelengths: µm, the
     lens's primary one by default. points: across the grid. Vignetting factors are left out: chief rays go through the
     middle of the pupil. Raises NothingToShow for the axis alone.
     """
@@ -115,12 +115,8 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     refuse_axis(largest)
     warn_of_filling(lens, largest)
     rays = points**2 * len(lens.wavelengths)
-    afford(
-        RAY_BYTES * rays,
-        f"{rays:,} chief rays of {points:,} × {points:,} objects",
-        helps="ask for fewer {points}",
-    )
-    described, _, corner, found = in_object_space(lens, largest)
+    afford(RAY_BYTES * rays, f"{rays:,} chief rays of {points:,} × {points:,} objects", helps="ask for fewer {points}")
+    described, _, corner, exists = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)
     y, x = torch.meshgrid(line, line, indexing="ij")
@@ -141,5 +137,5 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
         actual=landed[..., 3:].unflatten(-1, grid),
         ideal=ideal.unflatten(-1, grid),
         distortion=safe_divide(reached - length, length).unflatten(-1, grid),
-        valid=(valid & found).movedim(0, -1)[:, 3:].unflatten(-1, grid),
+        valid=(valid & exists).movedim(0, -1)[:, 3:].unflatten(-1, grid),
     )

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.panels import chart, few, field_axis, field_name, finished, marks
-from raytrace.analysis.result import OverField
-from raytrace.analysis.setting import Numbers, Points, like, refuse_axis, scene_of, setting, shown, wavelength_shares
+from raytrace.analysis.result import OverField, shown
+from raytrace.analysis.setting import Numbers, Points, like, refuse_axis, scene_of, setting, wavelength_shares
 from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_rings
-from raytrace.plotting.style import GREY, array, field_colour, styled
+from raytrace.plotting.style import GREY, Figure, array, field_colour, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.clear_pupil import arms_of, is_clipped
 from raytrace.tracing.wavefront import wavefront_of
@@ -25,9 +25,10 @@ _TERMS = 45  # Zernike terms (to degree 8) of the map from the pupil to directio
 
 @value
 class RelativeIllumination(OverField):
-    """illumination: (F,), 1 on the axis; projected_solid_angle: (F,) sr; fields: (2, F).
+    """Relative illumination over the field.
 
-    marked: whether the fields were asked for, and are marked on the curve.
+    illumination: (F,), 1 on the axis; projected_solid_angle: (F,) sr; fields: (2, F).
+    marked: whether the fields were specified, and are marked on the curve.
     """
 
     lens: Lens
@@ -49,10 +50,10 @@ class RelativeIllumination(OverField):
         return _illumination(self.lens, fields)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Relative illumination over the field, and cos⁴θ where fields are angles. Requested fields are marked."""
         curves = self.drawn()
-        _, panel = chart(5.4, 3.6, field_name(curves.lens), "relative illumination")
+        panel = chart(5.4, 3.6, field_name(curves.lens), "relative illumination")
         order = np.argsort(field_axis(curves), kind="stable")
         field, values = field_axis(curves)[order], array(curves.illumination)[order]
         look = {"color": field_colour(0), "linewidth": 1.5, "clip_on": False, "zorder": 3, **few(field)}

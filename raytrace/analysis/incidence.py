@@ -9,7 +9,7 @@ from raytrace.analysis.result import OverField
 from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setting
 from raytrace.maths.numerics import dot, value
 from raytrace.maths.result import Table, masked
-from raytrace.plotting.style import GREY, INK, array, field_colour, styled
+from raytrace.plotting.style import GREY, INK, Figure, array, field_colour, styled
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
@@ -60,10 +60,10 @@ class Incidence(OverField):
         return _incidence(self.lens, fields)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Angles at the sensor over the image height, of the first wavelength: the chief ray inside its beam."""
         curves = self.drawn()
-        _, panel = chart(5.6, 3.8, "image height (mm)", "angle of incidence on the sensor (°)")
+        panel = chart(5.6, 3.8, "image height (mm)", "angle of incidence on the sensor (°)")
         table = curves.summary()
         height = array(table["height"][:, 0])
         order = np.argsort(height)
@@ -97,7 +97,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), against (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     along = torch.cat([along, torch.zeros_like(along[:1])])
-    angles, valid, reached = [], [], rays.valid
+    angles, arrive, reached = [], [], rays.valid
     crossings = lens_steps(lens, rays, lens.wavelengths[:, None])
     gap = None
     for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
@@ -106,11 +106,11 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
         angles.append(_angle(surface, direction, crossing.rays.position, along))
         rays, gap = crossing.rays, gap_behind(surface)
         if surface.is_break:
-            valid.append(torch.zeros_like(reached))
+            arrive.append(torch.zeros_like(reached))
             continue
         is_chief = torch.arange(3, device=along.device) == _CHIEF
-        valid.append(reached & (rays.valid | is_chief))
-    valid = torch.stack(valid, -1)
+        arrive.append(reached & (rays.valid | is_chief))
+    valid = torch.stack(arrive, -1)
     return Incidence(
         lens=lens,
         fields=fields,

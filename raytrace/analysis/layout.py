@@ -4,7 +4,7 @@ import html
 import io
 import math
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -35,9 +35,17 @@ from raytrace.tracing.lens_report import Info, text
 from raytrace.tracing.trace import trace_lens
 from raytrace.words import option
 
-_LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
+if TYPE_CHECKING:  # slow to load
+    from matplotlib.patches import Polygon
+
+_LEAD = 0.14  # of the length of the lens: rays of a far object start at this distance in front of it
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
 
+
+Places = list[cross_section.Section]
+
+#: The paths of the rays of every field.
+Paths = list[list[cross_section.RayPath]]
 
 #: From where a lens is looked at.
 VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
@@ -51,8 +59,8 @@ ALL = "all"
 class Layout(Result):
     """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
 
-    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
-    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
+    view: a key of VIEWS. configuration: ALL where the configurations of the lens are superimposed, else None.
+    has_fields: whether the fields were specified; otherwise each configuration is drawn with its nominal fields.
     """
 
     lens: Lens
@@ -71,7 +79,7 @@ class Layout(Result):
         return f"{self.lens.name or 'Lens'}: field {points} {self.lens.fields.unit}"
 
     @style.styled
-    def draw(self):
+    def draw(self) -> style.Figure:
         """The lens in cross section or in space: glass filled by index, mirrors hatched, the stop marked.
 
         Rays are those of the primary wavelength, coloured by field, or coloured by wavelength where several are
@@ -117,7 +125,7 @@ def layout(
     that is shown; view: "yz" (from the side), "xz" (from above) or "3d" (in space); wavelengths: µm, by default the
     primary one; rays of several are coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all":
     superimposed, rays coloured by configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made.
-    Raises ValueError for a view or a configuration that there is not.
+    Raises ValueError for an unknown view or configuration.
     """
     if view not in VIEWS:
         raise ValueError(f"{option('view', view)}: expected one of {', '.join(VIEWS)}")
@@ -126,11 +134,13 @@ def layout(
             f"{option('view', '3d')}: shows one configuration; {option('configuration', 'all')} is drawn from the "
             "side or from above"
         )
-    if configuration not in (None, ALL):
+    if isinstance(configuration, str) and configuration != ALL:
+        raise ValueError(f"{option('configuration', configuration)}: expected a number from 1, or {ALL}")
+    if isinstance(configuration, int):
         lens = lens.configuration(configuration)
     chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
-    for one in lens.configurations if configuration == ALL else (lens,):
-        warn_of_defects(one)
+    for drawn in lens.configurations if configuration == ALL else (lens,):
+        warn_of_defects(drawn)
     every = ALL if configuration == ALL else None
     points = field_points(fields, like=lens)
     count = rays * points.shape[1] * (1 if chosen is None else len(chosen))
@@ -140,21 +150,22 @@ def layout(
     return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
 
-def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor):
+def _superimposed(figure_of: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor) -> style.Figure:
     """The lens in all its configurations in one cross section, rays coloured by configuration."""
     figure, colours = style.new_figure(8.0, 4.0), style.field_colours(len(lenses))
     axes = figure.add_subplot()
     drawn = []
     for lens, colour in zip(lenses, colours, strict=True):
-        how = {"fields": fields if found.has_fields else field_points(None, like=lens), "rays": found.rays}
-        drawn.append(_drawn(axes, lens, wavelengths=wavelengths, view=found.view, colour=colour, **how))
+        points = fields if figure_of.has_fields else field_points(None, like=lens)
+        rays, view = figure_of.rays, figure_of.view
+        drawn.append(_drawn(axes, lens, fields=points, wavelengths=wavelengths, rays=rays, view=view, colour=colour))
     _framed(axes, drawn)
     width, height = _page_size(axes)
     figure.set_size_inches(width, height)
     return _titled(figure, lenses[0], width, "Configuration", map(str, range(1, len(colours) + 1)), colours)
 
 
-def _page_size(axes) -> tuple[float, float]:
+def _page_size(axes: style.Axes) -> tuple[float, float]:
     """Width and height in inches of a page for the cross section in axes."""
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     shape = (high - low) / (right - left)
@@ -162,7 +173,9 @@ def _page_size(axes) -> tuple[float, float]:
     return width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
 
 
-def _titled(figure, lens: Lens, width: float, title: str, labels: Iterable[str], colours: Sequence):
+def _titled(
+    figure: style.Figure, lens: Lens, width: float, title: str, labels: Iterable[str], colours: Sequence
+) -> style.Figure:
     """The figure with the name of the lens and a legend of colours."""
     figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     entries = zip(colours, labels, strict=True)
@@ -175,7 +188,7 @@ def _titled(figure, lens: Lens, width: float, title: str, labels: Iterable[str],
     return figure
 
 
-def _draw_spectrum(axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
+def _draw_spectrum(axes: style.Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
     """Where rays of every wavelength land on the image."""
     points = hexapolar(4, dtype=wavelengths.dtype, device=wavelengths.device)[0]
     end = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelengths), wavelengths[:, None])
@@ -192,19 +205,19 @@ def _draw_spectrum(axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> Non
     axes.set_title("on the image", fontsize=8.5, color=style.GREY, pad=4)
 
 
-def _finished(figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float):
+def _finished(figure: style.Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float) -> style.Figure:
     """The figure with its title and its legend: fields, or wavelengths where there are several."""
     if len(wavelengths) > 1:
         title, labels = "Wavelength", [f"{float(wavelength):g} µm" for wavelength in wavelengths]
     else:
-        title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T]
+        title, labels = field_title(lens), [field_label(lens, field) for field in style.array(fields).T.tolist()]
     colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
     colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
     return _titled(figure, lens, width, title, labels, colours)
 
 
 def draw_layout(
-    axes,
+    axes: style.Axes,
     lens: Lens,
     *,
     fields: Tensor,
@@ -217,26 +230,26 @@ def draw_layout(
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
 
 
-def on_one_scale(panels: Sequence) -> None:
-    """Give cross sections in axes of one size the same scale: each stays in the middle of what it shows."""
+def on_one_scale(panels: Sequence[style.Axes]) -> None:
+    """Give cross sections in axes of one size the same scale; the middle of each stays where it is."""
     limits = [(panel.get_xlim(), panel.get_ylim()) for panel in panels]
-    width, height = (max(abs(one[k][1] - one[k][0]) for one in limits) for k in (0, 1))
+    width, height = (max(abs(limit[k][1] - limit[k][0]) for limit in limits) for k in (0, 1))
     for panel, ((left, right), (low, high)) in zip(panels, limits, strict=True):
         panel.set_xlim(0.5 * (left + right - width), 0.5 * (left + right + width))
         panel.set_ylim(0.5 * (low + high - height), 0.5 * (low + high + height))
 
 
 class _Drawn(NamedTuple):
-    """What a cross section takes: the places of its surfaces, whether it is bent, its extent in z and in height, mm."""
+    """A cross section in axes: the places of its surfaces, whether it is bent, its extent in z and in height, mm."""
 
-    places: list[cross_section.Section]
+    places: Places
     is_bent: bool
     extent: tuple[float, float]
     heights: tuple[float, float]
 
 
 def _drawn(
-    axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
+    axes: style.Axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
 ) -> _Drawn:
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
@@ -253,16 +266,18 @@ def _drawn(
         start = -distance if near else front - _LEAD * size
         dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
         points = fan(rays, view[0], dtype=dtype, device=device)[0]
-        how = {"fields": fields, "z_start": start, "view": view}
-        coloured = [cross_section.ray_paths(lens, points, wavelength=wavelength, **how) for wavelength in wavelengths]
-        paths = [field for fields in coloured for field in fields]
+        paths = []
+        for wavelength in wavelengths:
+            paths += cross_section.ray_paths(
+                lens, points, fields=fields, wavelength=wavelength, z_start=start, view=view
+            )
 
         _draw_glass(axes, lens, places, radii, indices)
         _draw_mirrors(axes, lens, places, radii, paths)
         _draw_apertures(axes, lens, places, radii)
         _draw_stop(axes, lens, places, radii, stop)
-        own = [one for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for one in row]
-        _draw_rays(axes, paths, own if colour is None else [colour] * len(paths))
+        colours = [each for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for each in row]
+        _draw_rays(axes, paths, colours if colour is None else [colour] * len(paths))
         half = _draw_sensor(axes, lens, places[-1], radii, paths)
         if near:
             _draw_object(axes, lens, places[0], paths)
@@ -272,18 +287,18 @@ def _drawn(
     return _Drawn(places, bent, (min(first, start), last), heights)
 
 
-def _framed(axes, drawn: Sequence[_Drawn]) -> None:
-    """The frame of one cross section, or of several in each other's place."""
-    if any(one.is_bent for one in drawn):
-        _frame_bent(axes, [one.places for one in drawn])
+def _framed(axes: style.Axes, drawn: Sequence[_Drawn]) -> None:
+    """The frame of one cross section, or of several superimposed ones."""
+    if any(section.is_bent for section in drawn):
+        _frame_bent(axes, [section.places for section in drawn])
         return
-    starts, ends = zip(*(one.extent for one in drawn), strict=True)
-    low, high = zip(*(one.heights for one in drawn), strict=True)
+    starts, ends = zip(*(section.extent for section in drawn), strict=True)
+    low, high = zip(*(section.heights for section in drawn), strict=True)
     _frame(axes, (min(starts), max(ends)), (min(low), max(high)))
 
 
-def _extent(lens: Lens, places: list[cross_section.Section], radii: list[float]) -> tuple[tuple, tuple]:
-    """How far surfaces reach, ((left, right), (low, high)) mm; the image by its vertex."""
+def _extent(lens: Lens, places: Places, radii: list[float]) -> tuple[tuple, tuple]:
+    """The extent of the surfaces, ((left, right), (low, high)) mm; the image by its vertex."""
     right, up = [places[-1].origin[0]], [places[-1].origin[1]]
     for k in range(1, len(places) - 1):
         height = np.array([-radii[k], 0.0, radii[k]])
@@ -292,28 +307,26 @@ def _extent(lens: Lens, places: list[cross_section.Section], radii: list[float])
     return (min(right), max(right)), (min(up), max(up))
 
 
-def _front(places: list[cross_section.Section], radii: list[float], lens: Lens) -> float:
+def _front(places: Places, radii: list[float], lens: Lens) -> float:
     """The leftmost point of the first surface of a lens whose axis bends, mm."""
     height = np.array([-radii[1], radii[1]])
     return float(min(0.0, *places[1].at(cross_section.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 
 
-def _draw_glass(
-    axes, lens: Lens, places: list[cross_section.Section], radii: list[float], indices: list[float]
-) -> None:
+def _draw_glass(axes: style.Axes, lens: Lens, places: Places, radii: list[float], indices: list[float]) -> None:
     for k in range(1, len(places) - 1):
         if indices[k] <= cross_section.GLASSY or lens.surfaces[k].is_break:
             continue
         shape = cross_section.glass(lens, k, places, radii, indices)
         if shape is not None:
-            look = {"facecolor": style.tint(indices[k]), "edgecolor": style.INK, "linewidth": 0.7}
-            axes.fill(*shape, **look, zorder=2, gid=f"glass {k}")
-    for k in range(1, len(places) - 1):  # what stands in air and bends light: ideal lenses, gratings
+            colour = style.tint(indices[k])
+            axes.fill(*shape, facecolor=colour, edgecolor=style.INK, linewidth=0.7, zorder=2, gid=f"glass {k}")
+    for k in range(1, len(places) - 1):  # thin structures in air: ideal lenses, gratings
         if lens.surfaces[k].phase is not None and not lens.surfaces[k].is_mirror:
             _draw_thin(axes, lens.surfaces[k], places[k], radii[k])
 
 
-def _draw_thin(axes, surface: Surface, place: cross_section.Section, radius: float) -> None:
+def _draw_thin(axes: style.Axes, surface: Surface, place: cross_section.Section, radius: float) -> None:
     """A thin structure: a line along the surface, with arrows at the ends of an ideal lens."""
     height = np.linspace(-radius, radius, 81)
     line = place.at(cross_section.depth(surface, height, place.direction), height)
@@ -328,7 +341,7 @@ def _draw_thin(axes, surface: Surface, place: cross_section.Section, radius: flo
             axes.plot(*corners, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _draw_mirrors(axes, lens: Lens, places: list[cross_section.Section], radii: list[float], paths) -> None:
+def _draw_mirrors(axes: style.Axes, lens: Lens, places: Places, radii: list[float], paths: Paths) -> None:
     bent = cross_section.is_bent(lens)
     for k, side in enumerate(cross_section.sides(lens)):
         surface = lens.surfaces[k]
@@ -351,7 +364,7 @@ def _draw_mirrors(axes, lens: Lens, places: list[cross_section.Section], radii: 
             axes.plot(*front, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
 
 
-def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii: list[float]) -> None:
+def _draw_apertures(axes: style.Axes, lens: Lens, places: Places, radii: list[float]) -> None:
     """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
@@ -369,13 +382,14 @@ def _draw_apertures(axes, lens: Lens, places: list[cross_section.Section], radii
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
                 most = radii[k] + outward
-                height = np.linspace(*np.clip((centre + low, centre + high), -most, most), 41)
+                first, last = np.clip([float(centre + low), float(centre + high)], -most, most)
+                height = np.linspace(first, last, 41)
                 edge = 0.9999 * edge_radius(surface)
                 depth = cross_section.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes, lens: Lens, places: list[cross_section.Section], radii: list[float], radius: float) -> None:
+def _draw_stop(axes: style.Axes, lens: Lens, places: Places, radii: list[float], radius: float) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
     surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
     on_glass = not surface.is_plane or surface.is_mirror
@@ -388,7 +402,7 @@ def _draw_stop(axes, lens: Lens, places: list[cross_section.Section], radii: lis
         axes.fill(*corners, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
 
 
-def _draw_rays(axes, paths, colours) -> None:
+def _draw_rays(axes: style.Axes, paths: Paths, colours: Sequence) -> None:
     for field, colour in zip(paths, colours, strict=True):
         for path in field:
             if path.status == "ok":
@@ -401,8 +415,8 @@ def _draw_rays(axes, paths, colours) -> None:
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
 
-def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[float], paths) -> float:
-    """The image surface, as far as the rays need it; returns its half height in mm."""
+def _draw_sensor(axes: style.Axes, lens: Lens, place: cross_section.Section, radii: list[float], paths: Paths) -> float:
+    """Draw the image surface, as large as the rays need it; returns its half height in mm."""
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
     low, high = min(hits, default=0.0), max(hits, default=0.0)
@@ -415,7 +429,7 @@ def _draw_sensor(axes, lens: Lens, place: cross_section.Section, radii: list[flo
     return half
 
 
-def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
+def _draw_object(axes: style.Axes, lens: Lens, place: cross_section.Section, paths: Paths) -> None:
     heights = [abs(float(place.height(path.z[0], path.y[0]))) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
@@ -424,13 +438,13 @@ def _draw_object(axes, lens: Lens, place: cross_section.Section, paths) -> None:
         axes.plot(*place.at(depth, y), color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _ray_heights(paths) -> tuple[float, float]:
-    """Lowest and highest y in mm of rays that do not run astray."""
+def _ray_heights(paths: Paths) -> tuple[float, float]:
+    """Lowest and highest y in mm of rays that arrive or are vignetted."""
     y = [path.y for field in paths for path in field if path.status in ("ok", "vignetted")]
     return (float(np.concatenate(y).min()), float(np.concatenate(y).max())) if y else (0.0, 0.0)
 
 
-def _frame(axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
+def _frame(axes: style.Axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
     """Optical axis, limits and scale bar."""
     length = extent[1] - extent[0]
     margin = 0.025 * length
@@ -445,11 +459,11 @@ def _frame(axes, extent: tuple[float, float], heights: tuple[float, float]) -> N
     axes.axis("off")
 
 
-def _frame_bent(axes, ways: Sequence[Sequence[cross_section.Section]]) -> None:
+def _frame_bent(axes: style.Axes, ways: Sequence[Sequence[cross_section.Section]]) -> None:
     """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
     axes.relim()
     for patch in axes.patches:
-        axes.update_datalim(patch.get_xy())
+        axes.update_datalim(cast("Polygon", patch).get_xy())
     (left, low), (right, high) = axes.dataLim.get_points()
     for places in ways:
         way = np.array([place.origin for place in places[1:]]).T

@@ -1,6 +1,8 @@
 """A lens in three dimensions, with the rays of its fields."""
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +17,13 @@ from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.geometry import Frame, frames
 
 _RINGS, _ARMS, _TILES = 6, 48, 80  # of the mesh of a surface; of obscurations across it
-_LEAD = 0.14  # of the size of the system: how far in front of it rays of a far object start
+_LEAD = 0.14  # of the size of the system: rays of a far object start at this distance in front of it
 _MIRROR = "#b9c2ca"
 
+Colour = str | tuple[float, ...]
 
-def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
+
+def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> style.Figure:
     """Surfaces as shaded meshes, glass with its edge, and the rays of both fans: z to the right, y upward."""
     figure = style.new_figure(7.5, 6.0)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
@@ -38,7 +42,7 @@ def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int):
 
 
 def _seen(points: np.ndarray) -> np.ndarray:
-    """Points (3, ...) of the system as the axes of the picture take them: z, x and y."""
+    """Points (3, ...) of the system in the axes of the picture: z, x and y."""
     return points[[2, 0, 1]]
 
 
@@ -53,8 +57,10 @@ def _mesh(surface: Surface, frame: Frame, radius: float) -> np.ndarray:
     return style.array(frame.outside(torch.stack([x, y, sag_at(surface, x, y)])))
 
 
-def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], indices: list[float]) -> np.ndarray:
-    """Draws them; returns all points (3, N) of their meshes."""
+def _draw_surfaces(
+    axes: style.Axes3D, lens: Lens, places: list[Frame], radii: list[float], indices: list[float]
+) -> np.ndarray:
+    """Draw the surfaces; returns all points (3, N) of their meshes."""
     meshes = {}
     for k, surface in enumerate(lens.surfaces[1:-1], 1):
         if surface.is_break:
@@ -79,7 +85,7 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
     return np.concatenate([mesh.reshape(3, -1) for mesh in meshes.values()], axis=1)
 
 
-def _draw_obscurations(axes, surface: Surface, frame: Frame, radius: float) -> None:
+def _draw_obscurations(axes: style.Axes3D, surface: Surface, frame: Frame, radius: float) -> None:
     """The parts of the drawn surface that obscurations block, in small tiles."""
     obscurations = [aperture for aperture in surface.apertures if aperture.obscures]
     line = torch.linspace(-radius, radius, _TILES + 1, dtype=frame.origin.dtype, device=frame.origin.device)
@@ -91,19 +97,19 @@ def _draw_obscurations(axes, surface: Surface, frame: Frame, radius: float) -> N
         _shade(axes, style.array(frame.outside(torch.stack([x, y, sag_at(surface, x, y)]))), "#8c8c8c", 0.9, tiles)
 
 
-def _add_tiles(axes, tiles, **look) -> None:
+def _add_tiles(axes: style.Axes3D, tiles: Sequence[np.ndarray], **look: Any) -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     axes.add_collection3d(Poly3DCollection(tiles, **look))
 
 
-def _add_lines(axes, lines, **look) -> None:
+def _add_lines(axes: style.Axes3D, lines: Sequence[np.ndarray], **look: Any) -> None:
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     axes.add_collection3d(Line3DCollection(lines, **look))
 
 
-def _shade(axes, mesh: np.ndarray, colour, alpha: float, shown: np.ndarray | None = None) -> None:
+def _shade(axes: style.Axes3D, mesh: np.ndarray, colour: Colour, alpha: float, shown: np.ndarray | None = None) -> None:
     """The tiles of a mesh, all or those that are shown."""
     p = _seen(mesh)
     tiles = [
@@ -115,26 +121,28 @@ def _shade(axes, mesh: np.ndarray, colour, alpha: float, shown: np.ndarray | Non
     _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=alpha, shade=False)
 
 
-def _edge(axes, front: np.ndarray, back: np.ndarray, colour) -> None:
+def _edge(axes: style.Axes3D, front: np.ndarray, back: np.ndarray, colour: Colour) -> None:
     """The ground edge of glass, from rim to rim."""
     a, b = _seen(front[:, -1]), _seen(back[:, -1])
     tiles = [np.stack([a[:, j], b[:, j], b[:, j + 1], a[:, j + 1]]) for j in range(a.shape[1] - 1)]
     _add_tiles(axes, tiles, facecolor=colour, edgecolor="none", alpha=0.25, shade=False)
 
 
-def _rim(axes, mesh: np.ndarray, colour: str, width: float) -> None:
+def _rim(axes: style.Axes3D, mesh: np.ndarray, colour: str, width: float) -> None:
     lines = [_seen(mesh[:, -1]).T, *([_seen(mesh[:, 0]).T] if np.ptp(mesh[:, 0], axis=1).max() > 0 else [])]
     _add_lines(axes, lines, colors=colour, linewidths=width)
 
 
-def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int, start: float) -> list[np.ndarray]:
-    """Draws both fans of every field and wavelength; returns the points (3, C) of rays that arrive."""
+def _draw_rays(
+    axes: style.Axes3D, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int, start: float
+) -> list[np.ndarray]:
+    """Draw both fans of every field and wavelength; returns the points (3, C) of rays that arrive."""
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points = torch.cat([fan(rays, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
     colours, arrived = style.ray_colours(fields.shape[1], wavelengths.tolist()), []
     for row, wavelength in zip(colours, wavelengths, strict=True):
-        found = cross_section.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
-        for colour, paths in zip(row, found, strict=True):
+        every = cross_section.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
+        for colour, paths in zip(row, every, strict=True):
             whole = [path.points for path in paths if path.status == "ok"]
             lines = [_seen(path).T for path in whole]
             _add_lines(axes, lines, colors=[colour], linewidths=0.7, alpha=0.9)
@@ -142,7 +150,7 @@ def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int,
     return arrived
 
 
-def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
+def _draw_image(axes: style.Axes3D, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
     """The image surface, a rectangle about where rays end; returns its corners (3, 4)."""
     if not arrived:
         return np.zeros((3, 0))
@@ -158,8 +166,8 @@ def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
     return corners
 
 
-def _fill_page(axes, points: np.ndarray, span: np.ndarray) -> None:
-    """Make the page as high as what is seen of points (3, N) needs, and that as large as the page.
+def _fill_page(axes: style.Axes3D, points: np.ndarray, span: np.ndarray) -> None:
+    """Make the page as high as the projection of points (3, N) needs, and the projection as large as the page.
 
     Axes in space are square: they are made as wide as the page, and reach beyond it above and below.
     """
@@ -174,8 +182,8 @@ def _fill_page(axes, points: np.ndarray, span: np.ndarray) -> None:
     axes.set_box_aspect(span, zoom=0.95 * min(axes.bbox.width / wide, room / high))
 
 
-def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
-    """Width and height in dots of what points (3, N) need about the middle of the box."""
+def _seen_size(axes: style.Axes3D, points: np.ndarray) -> tuple[float, float]:
+    """Width and height in dots of the projection of points (3, N) about the middle of the box."""
     axes.apply_aspect()
     from mpl_toolkits.mplot3d import proj3d
 
@@ -185,7 +193,7 @@ def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
     return 2 * np.abs(x).max() * dots[0], 2 * np.abs(y).max() * dots[1]
 
 
-def _frame(axes, points: np.ndarray) -> None:
+def _frame(axes: style.Axes3D, points: np.ndarray) -> None:
     """Equal scales about everything that is drawn, a scale bar, and no box."""
     p = _seen(points)
     low, high = p.min(axis=1), p.max(axis=1)

@@ -9,7 +9,7 @@ from raytrace.analysis.setting import Numbers, like
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import axis, masked
-from raytrace.plotting.style import GREY, array, styled
+from raytrace.plotting.style import GREY, Figure, array, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.spot import image_rays
@@ -41,9 +41,9 @@ class LongitudinalAberration(Analysis):
         }
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Crossings with the axis over the height in the pupil, drawn upwards."""
-        _, panel = chart(4.2, 4.4, "crossing with the axis, from the sensor (mm)", "height in the pupil")
+        panel = chart(4.2, 4.4, "crossing with the axis, from the sensor (mm)", "height in the pupil")
         by_wavelength(panel, self, seen(self.crossing, self.valid).T, array(self.pupil), linewidth=1.4)
         panel.axvline(0, color=GREY, linewidth=0.6)
         panel.set_ylim(0, 1)
@@ -59,14 +59,14 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     """
     need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
-    rays = points * len(lens.wavelengths)
-    afford(RAY_BYTES * rays, f"{rays:,} rays", helps="ask for fewer {points}")
+    count = points * len(lens.wavelengths)
+    afford(RAY_BYTES * count, f"{count:,} rays", helps="ask for fewer {points}")
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
     on_axis = torch.stack([torch.zeros_like(heights), heights])
-    axis = torch.zeros_like(on_axis[:, :1])
-    warn_of_filling(lens, axis)
-    rays = image_rays(lens, on_axis, fields=axis)
+    field = torch.zeros_like(on_axis[:, :1])
+    warn_of_filling(lens, field)
+    rays = image_rays(lens, on_axis, fields=field)
     _, M, N = rays.direction[:, 0]
     crossing = -safe_divide(rays.position[1, 0] * N, M)
     return LongitudinalAberration(lens, pupil, crossing, rays.valid[0] & (M != 0))

@@ -3,7 +3,8 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +38,7 @@ from raytrace.budget import RAY_BYTES, piece
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.result import Table, axis
 from raytrace.maths.sampling import gauss_rings
-from raytrace.plotting.style import GREY, array, number_text, styled
+from raytrace.plotting.style import GREY, Figure, array, number_text, styled
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, aligned, vector, with_sensor_distance
 from raytrace.system.rays import Rays
@@ -68,7 +69,7 @@ class Mtf(Analysis):
         modulation exceeds; None for rays alone.
     frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: all fields by rays, without diffraction.
     by_rays: (F,) bool, fields by rays, without diffraction.
-    marked: whether the frequencies were asked for, and are marked on the curves.
+    marked: whether the frequencies were specified, and are marked on the curves.
     """
 
     lens: Lens
@@ -103,17 +104,17 @@ class Mtf(Analysis):
         return _tables(self)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Modulation over spatial frequency: tangential solid, sagittal dashed, the highest diffraction limit grey."""
         curves = self.drawn()
-        _, panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
+        panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
         frequency = array(curves.frequencies)
         by_field(panel, curves, frequency, tangential=array(curves.tangential), sagittal=array(curves.sagittal))
         if self.marked:
             mark_fields(panel, array(self.frequencies), array(self.tangential), array(self.sagittal))
         if curves.limit is not None:
-            look = {"color": GREY, "linewidth": 1.0, "linestyle": ":"}
-            panel.plot(frequency, array(curves.limit.amax((0, 1))), label="diffraction limit", **look)
+            limit = array(curves.limit.amax((0, 1)))
+            panel.plot(frequency, limit, color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
         panel.set(xlim=(0, frequency.max()), ylim=(0, 1.0))
         return finished(panel, curves, f"{transfer(curves)} MTF", 6)
 
@@ -153,10 +154,10 @@ class ThroughFocusMtf(Analysis):
         }
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """Modulation at one frequency over the sensor distance, a smooth curve through the places computed."""
         modulation = f"modulation at {number_text(float(self.frequency), 4)} cycles/mm"
-        _, panel = chart(6.4, 4.0, "sensor distance (mm)", modulation)
+        panel = chart(6.4, 4.0, "sensor distance (mm)", modulation)
         distance = array(self.sensor_distances)
         fine = np.linspace(distance.min(), distance.max(), _SMOOTH)
         curves = {"tangential": self.tangential, "sagittal": self.sagittal}
@@ -213,7 +214,7 @@ def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, choice: Tensor | None,
     """choice: (F,) bool, fields by rays; None: as `mtf` decides for each."""
     if choice is not None and bool(choice.all()):
         return geometric_mtf(lens, fields, frequencies, marked=marked)
-    wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
+    wanted: list[bool | None] = [None] * fields.shape[1] if choice is None else choice.tolist()
     rows = [_of_field(lens, *each, frequencies) for each in zip(fields.split(1, 1), wanted, strict=True)]
     tangential, sagittal = (torch.cat(parts) for parts in list(zip(*rows, strict=True))[:2])
     by_rays = torch.tensor([row[2] for row in rows], device=fields.device)
@@ -231,7 +232,7 @@ def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bo
 def _of_field(
     lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor, memo: Memo | None = None
 ) -> tuple[Tensor, Tensor, bool, Callable[[], tuple[Tensor, Tensor]]]:
-    """Tangential and sagittal MTF (1, K) of a field (2, 1), whether of rays, and what makes both of its pupil alone.
+    """Tangential and sagittal MTF (1, K) of a field (2, 1), whether of rays, and the function that makes its limit.
 
     memo: of its beam at other sensors.
     """
@@ -293,7 +294,7 @@ def _through_focus(
 ) -> ThroughFocusMtf:
     """The MTF at each sensor distance (S,). A beam is aimed and traced once: for the `Memo` of a field the sensor
     distance is a variable, so that rays are stored in front of the sensor."""
-    wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
+    wanted: list[bool | None] = [None] * fields.shape[1] if choice is None else choice.tolist()
     constant = not any(varies(number) for number in pytree.tree_leaves((lens, fields, frequency)))
     work = [(f, distance) for f in range(len(wanted)) for distance in distances]
     memo, last, rows = None, None, []
@@ -310,19 +311,19 @@ def _through_focus(
     return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, whole, by_rays)
 
 
-def transfer(found: Mtf | ThroughFocusMtf) -> str:
-    """Which transfer a result has: "diffraction", "geometric", or both with the fields, as for a title."""
-    some = found.by_rays.any(0) if found.by_rays.dim() == 2 else found.by_rays
-    if found.geometric or not bool(some.any()):
-        return "geometric" if found.geometric else "diffraction"
-    names = " and ".join(field_words(found.lens, field) for field in found.fields.T[some])
+def transfer(curves: Mtf | ThroughFocusMtf) -> str:
+    """The transfer of a result: "diffraction", "geometric", or both with the fields, as for a title."""
+    some = curves.by_rays.any(0) if curves.by_rays.dim() == 2 else curves.by_rays
+    if curves.geometric or not bool(some.any()):
+        return "geometric" if curves.geometric else "diffraction"
+    names = " and ".join(field_words(curves.lens, field) for field in curves.fields.T[some])
     return f"diffraction (geometric for {names})"
 
 
-def _tables(found: Mtf | ThroughFocusMtf) -> list[Table]:
+def _tables(curves: Mtf | ThroughFocusMtf) -> list[Table]:
     """The table, with a line on fields that are geometric by default."""
-    table = found.thinned(found.columns(), found.EVERY)
-    note = [f"transfer: {transfer(found)}"] if bool(found.by_rays.any()) else []
+    table = curves.thinned(curves.columns(), curves.EVERY)
+    note = [f"transfer: {transfer(curves)}"] if bool(curves.by_rays.any()) else []
     return [table._replace(notes=[*table.notes, *note])]
 
 
@@ -345,7 +346,7 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * torch.where(torch.isfinite(real), real, axial_f_number(lens)))
 
 
-def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid) -> tuple[Tensor, Tensor]:
+def mtf_on_grid(scene: Scene, frequencies: Tensor, shares: Tensor, **grid: Any) -> tuple[Tensor, Tensor]:
     """Tangential and sagittal MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs.
 
     shares: (W,) of the wavelengths of the scene; grid: options of `exit_pupil`.
@@ -362,8 +363,8 @@ def _of_pupil(pupil: ExitPupil, frequencies: Tensor, shares: Tensor) -> tuple[Te
 
 
 def _sheared(scene: Scene, frequencies: Tensor) -> Callable[..., tuple[Tensor, Tensor]] | None:
-    """What makes the same by the quadrature of `pupil_autocorrelation.py`, where the wave is polynomial and the grid is
-    slower; `perfect`: without aberrations.
+    """The function that makes the same by a quadrature of the sheared pupil, where the wave is polynomial and the grid
+    is slower; `perfect`: without aberrations.
 
     The grid needs points for all that the blur could modulate, the quadrature for the frequencies that are listed.
     """
@@ -372,8 +373,9 @@ def _sheared(scene: Scene, frequencies: Tensor) -> Callable[..., tuple[Tensor, T
     usual = not points_needed(beam) > _FINE_GRID
     if usual or frequencies.requires_grad or not bool(beam.wavefront.valid.all()):
         return None
-    rules = [rule_of_blur(float((beam.blur.max() * frequency.abs()).detach())) for frequency in frequencies]
-    polynomials = None if None in rules else polynomials_of(scene, beam)
+    turns = ((beam.blur.max() * frequencies.abs()).detach()).tolist()
+    rules = [rule for rule in map(rule_of_blur, turns) if rule is not None]
+    polynomials = polynomials_of(scene, beam) if len(rules) == len(turns) else None
     if polynomials is None:
         return None
     shift = _from_primary(scene.lens, beam.wavefront.centre[:2, 0])
@@ -381,12 +383,12 @@ def _sheared(scene: Scene, frequencies: Tensor) -> Callable[..., tuple[Tensor, T
 
     def sections(*, perfect: bool = False) -> tuple[Tensor, Tensor]:
         light = polynomials * polynomials.new_tensor([1.0, 1.0, 1.0 - perfect]).reshape(3, 1, 1, 1, 1)
-        result = []
+        curves = []
         for section, along in ((1, light), (0, light.mT)):
             shear = frequencies[:, None] / (beam.half[section, 0, 0] * beam.waves_per)
             parts = _overlaps(along, shear, [_RULES[0]] * len(rules) if perfect else rules)
-            result.append(modulation(parts.mT[None], frequencies, (1 - perfect) * shift[section], weights))
-        return tuple(result)
+            curves.append(modulation(parts.mT[None], frequencies, (1 - perfect) * shift[section], weights))
+        return curves[0], curves[1]
 
     return sections
 
@@ -396,17 +398,17 @@ def rule_of_blur(turns: float) -> int | None:
     return next((n for n in _RULES if n >= 16 + 6 * turns), None)
 
 
-def _overlaps(polynomials: Tensor, shear: Tensor, rules: list[int]) -> Tensor:
+def _overlaps(polynomials: Tensor, shear: Tensor, rules: Sequence[int]) -> Tensor:
     """OTF (K, W) of polynomials (3, 1, W, N, N) at shears (K, W) by rules (K,), 1 without a shear."""
-    found = torch.ones_like(shear) + 0j
+    transfers = torch.ones_like(shear) + 0j
     sheared = (shear != 0).any(-1).tolist()
     for points in sorted(set(rules)):
         chosen = torch.tensor([k for k, rule in enumerate(rules) if rule == points and sheared[k]], dtype=torch.int64)
         together = piece(64 * points**2 * polynomials.shape[-1] * shear.shape[1])
         for some in chosen.to(shear.device).split(together) if len(chosen) else []:
             stacked = polynomials.expand(-1, len(some), -1, -1, -1)
-            found = found.index_copy(0, some, otf(stacked, shear[some].abs(), points))
-    return found
+            transfers = transfers.index_copy(0, some, otf(stacked, shear[some].abs(), points))
+    return transfers
 
 
 def otf_along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> Tensor:
@@ -474,7 +476,7 @@ def _together(lens: Lens, pupil: tuple[Tensor, Tensor]) -> int:
     return piece(2 * RAY_BYTES * len(lens.wavelengths) * len(pupil[1]))
 
 
-def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, rays: Rays, rule: Tensor) -> tuple:
+def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, rays: Rays, rule: Tensor) -> tuple[Tensor, Tensor]:
     """Tangential and sagittal MTF (F, K) of rays (3, F, W, P) of weights (P,)."""
     energy = torch.where(rays.valid, rule, 0.0)
     light = energy.sum(-1)
@@ -482,12 +484,12 @@ def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, rays: Rays, rule:
     hits = torch.where(rays.valid, rays.position[:2], 0.0)
     mean = (energy * hits).sum(-1) / light
     shift, weights = _from_primary(lens, mean), wavelength_shares(lens) * light
-    result = []
+    curves = []
     for along in (1, 0):
         offset = torch.where(rays.valid, hits[along] - mean[along][..., None], 0.0)
         otf = torch.stack([wave.sum(-1) for wave in _phasors(frequencies, offset, energy)], -1) / light[..., None]
-        result.append(modulation(otf, frequencies, shift[along], weights))
-    return tuple(result)
+        curves.append(modulation(otf, frequencies, shift[along], weights))
+    return curves[0], curves[1]
 
 
 def _phasors(frequencies: Tensor, offset: Tensor, weight: Tensor) -> Iterator[Tensor]:

@@ -7,7 +7,7 @@ that is lit evenly. W and p are polynomials of s that fit the rays of a few ring
 pupils cover is cut into lines along the shear from rim to rim, with Gaussian rules along and across: their error falls
 exponentially with their points, where cells of a grid err by their share at the rim.
 
-Derivatives are exact of what is computed: backward from the OTFs to the polynomials, by torch, and by the normal
+Derivatives are exact for the computed numbers: backward from the OTFs to the polynomials, by torch, and by the normal
 equations from these to the rays, whose derivatives by the variables come from the trace.
 
 Source: Hopkins, Proc. Phys. Soc. B 70, 1957 (the sheared pupil); Golub & Pereyra 1973 (derivative of a fit).
@@ -17,7 +17,7 @@ Where polynomials do not describe pupil and wave, the OTF is the autocorrelation
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -66,7 +66,7 @@ class Beam:
 
 
 def beam_of(scene: Scene) -> Beam:
-    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    like: dict[str, Any] = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     front = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
     directions = front.direction[:2]
     low = torch.where(front.usable, directions, torch.inf).amin(-1)
@@ -82,7 +82,7 @@ def polynomials_of(scene: Scene, beam: Beam) -> Tensor | None:
     """
     if any(stands_inside(aperture) for surface in scene.lens.surfaces for aperture in surface.apertures):
         return None
-    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    like: dict[str, Any] = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     for degree in _DEGREES:
         rings, arms = degree // 2 + 3, 2 * degree + 8
         points, weights = gauss_rings(rings, arms, **like)
@@ -101,19 +101,14 @@ def polynomials_of(scene: Scene, beam: Beam) -> Tensor | None:
         wanted = torch.stack([*(part.expand_as(waves) for part in torch.cat([points, others], 1)), waves], -1)
         fitted = len(root)
         q, r = torch.linalg.qr(root[:, None] * basis[..., :fitted, :])
-        found = torch.linalg.solve_triangular(r, q.mT @ (root[:, None] * wanted[..., :fitted, :]), upper=True)
-        missed = (wanted - basis @ found)[..., fitted:, 2].detach().abs().amax()
+        terms = torch.linalg.solve_triangular(r, q.mT @ (root[:, None] * wanted[..., :fitted, :]), upper=True)
+        missed = (wanted - basis @ terms)[..., fitted:, 2].detach().abs().amax()
         if float(missed) <= _MISSED:
-            table = found.new_zeros(3, *found.shape[:2], degree + 1, degree + 1)
-            at = tuple(torch.tensor(part, device=found.device) for part in zip(*powers, strict=True))
-            return _filled(table, at, found)
+            size = degree + 1
+            place = torch.tensor([i * size + j for i, j in powers], device=terms.device)
+            table = terms.new_zeros(3, *terms.shape[:2], size * size)
+            return table.index_copy(-1, place, terms.movedim(-1, 0)).unflatten(-1, (size, size))
     return None
-
-
-def _filled(table: Tensor, at: tuple[Tensor, Tensor], found: Tensor) -> Tensor:
-    """Coefficients (F, W, J, 3) at their powers in a table (3, F, W, N, N)."""
-    place = at[0] * table.shape[-1] + at[1]
-    return table.flatten(-2).index_copy(-1, place, found.movedim(-1, 0)).unflatten(-1, table.shape[-2:])
 
 
 def on_grid(polynomial: Tensor, line: Tensor) -> Tensor:
@@ -160,7 +155,7 @@ def exit_pupil(
     size: N points across, by default as many as keep blurs from overlapping, and `least`. Raises TooManyPoints where
     that is too many, or where the trace is predicted to take more than `seconds`; None: a long one is warned of.
     """
-    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    like: dict[str, Any] = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     beam = beam_of(scene)
     probe, middle, half = beam.wavefront, beam.middle, beam.half
     enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
@@ -187,12 +182,12 @@ def exit_pupil(
     )
     line = (2 * torch.arange(size, **like) + 1 - size) / size
     inside = line * line + (line * line)[:, None] <= 1
-    own = None
+    on_disc = None  # of each field and wavelength
     if turn is not None:
         u, v = _on_disc(turn[..., None], line.expand(size, -1), line[:, None].expand(-1, size))
-        own = u * u + v * v <= 1
-        inside = own.any(2).any(1)[0]
-        own = own[..., inside]
+        on_disc = u * u + v * v <= 1
+        inside = on_disc.any(2).any(1)[0]
+        on_disc = on_disc[..., inside]
     parts, each = [pupil, by_l, by_m], _TRACED_BYTES
     if size > _TRACED or fit:
         polynomials = polynomials_of(scene, beam)
@@ -209,7 +204,7 @@ def exit_pupil(
         for some in zip(*(part[..., inside].split(together, -1) for part in parts), strict=True)
     ]
     field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
-    field, light = (part if own is None else torch.where(own, part, 0.0) for part in (field, light))
+    field, light = (part if on_disc is None else torch.where(on_disc, part, 0.0) for part in (field, light))
     energy = torch.where(probe.valid, probe.energy, 0.0)
     total = energy.sum(-1)
     offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
@@ -232,11 +227,11 @@ def _afford_time(scene: Scene, rays: int, seconds: float | None) -> None:
     """Raise TooManyPoints where a trace takes more than `seconds`; warn TakesLong of a long one without these."""
     aimed = 4 if scene.lens.ray_aiming == "real" else 1
     needed = rays * len(scene.lens.surfaces) * aimed * _SURFACE_SECONDS
-    what = f"the blur needs a grid of {rays:,} rays"
+    need = f"the blur needs a grid of {rays:,} rays"
     if seconds is None:
-        forewarn(needed, what, helps="use geometric rays")
+        forewarn(needed, need, helps="use geometric rays")
     elif needed > seconds:
-        raise TooManyPoints(f"{what}, {needed:.0f} s: focus the lens, or use geometric rays")
+        raise TooManyPoints(f"{need}, {needed:.0f} s: focus the lens, or use geometric rays")
 
 
 def _orders(degree: int) -> list[zernike.Order]:
@@ -330,7 +325,7 @@ def _rim_waves(scene: Scene) -> Tensor | None:
 
     None where the upper half of them adds more than _MISSED waves.
     """
-    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    like: dict[str, Any] = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     angle = 2 * math.pi / _RIM_RAYS * torch.arange(_RIM_RAYS, **like)
     points = torch.stack([torch.cos(angle), torch.sin(angle)])
     waves, valid = _traced(scene, points, torch.ones_like(angle))
@@ -359,11 +354,13 @@ _NEWTON = 12  # steps at the most
 _CLOSE = 1e-7  # of the pupil, from where one more step ends at rounding
 _WHOLE = 1.98  # of pupil radii: a shear that leaves nothing in common
 
+Pair = tuple[Tensor, Tensor]
+
 
 class Layout(NamedTuple):
     """Rays of a beam: pupil points (2, R), their weights (R,), and powers (i, j) of s_x and s_y of the fit.
 
-    half: of a beam that is mirrored in the y axis its right half, by what is even in x, and p_x by what is odd.
+    half: the right half of a beam that is symmetric about the y axis; W and p_y are even in x, p_x is odd.
     """
 
     points: np.ndarray
@@ -373,9 +370,10 @@ class Layout(NamedTuple):
 
     @property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of W and p_y, and of p_x: (K, 2) each."""
+        """The powers of W and p_y, and of p_x: (K, 2) each."""
         every = np.array([(i, n - i) for n in range(self.degree + 1) for i in range(n + 1)])
-        return tuple(every[every[:, 0] % 2 == odd] if self.half else every for odd in (0, 1))
+        even, odd = (every[every[:, 0] % 2 == parity] if self.half else every for parity in (0, 1))
+        return even, odd
 
 
 def layout_of(degree: int, *, half: bool) -> Layout:
@@ -392,10 +390,10 @@ def layout_of(degree: int, *, half: bool) -> Layout:
 
 
 class Fit:
-    """Polynomials (B, N, N) of W, p_x and p_y in directions, and how they follow what they fit.
+    """Polynomials (B, N, N) of W, p_x and p_y in directions, and their derivatives by the fitted rays.
 
-    s = middle + scale * (u, v), which puts the beam into a square; `middle` and `scale` (2, B) are choices, which
-    nothing depends on.
+    s = middle + scale * (u, v), which puts the beam into a square; `middle` and `scale` (2, B) are choices without
+    effect on the polynomials in s.
     """
 
     def __init__(self, layout: Layout, wave: np.ndarray, directions: np.ndarray):
@@ -405,11 +403,11 @@ class Fit:
         self.middle, self.scale = 0.5 * (low + high), 0.5 * (high - low)
         if layout.half:
             self.middle[0], self.scale[0] = 0.0, np.abs(directions[0]).max(-1)
-        self.at = (directions - self.middle[..., None]) / self.scale[..., None]
+        self.places = (directions - self.middle[..., None]) / self.scale[..., None]
         even, odd = layout.powers
         px, py = (np.broadcast_to(p, wave.shape) for p in layout.points)
         root = np.sqrt(layout.weights)
-        self.parts = [_Part(powers, root, self.at, data) for powers, data in ((odd, px), (even, py), (even, wave))]
+        self.parts = [_Part(powers, root, self.places, data) for powers, data in ((odd, px), (even, py), (even, wave))]
 
     @property
     def polynomials(self) -> np.ndarray:
@@ -418,32 +416,32 @@ class Fit:
 
     @property
     def missed(self) -> np.ndarray:
-        """RMS (B,) in waves of what the polynomials of W leave."""
+        """RMS (B,) in waves of the residual of the polynomials of W."""
         return np.sqrt((self.layout.weights * self.parts[2].left ** 2).sum(-1) / self.layout.weights.sum())
 
     def by_rays(self, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By waves (Q, B, R) and directions (2, Q, B, R), from derivatives (3, Q, B, N, N) by the polynomials."""
         backs = [part.back(slope) for part, slope in zip(self.parts, slopes, strict=True)]
-        return backs[2][0], sum(at for _, at in backs) / self.scale[:, None, :, None]
+        return backs[2][0], sum(places for _, places in backs) / self.scale[:, None, :, None]
 
 
 class _Part:
     """One polynomial: c = V⁺ d, over powers (K, 2), of data (B, R) at places (2, B, R) with roots of weights (R,)."""
 
-    def __init__(self, powers: np.ndarray, root: np.ndarray, at: np.ndarray, data: np.ndarray):
+    def __init__(self, powers: np.ndarray, root: np.ndarray, places: np.ndarray, data: np.ndarray):
         self.powers, self.root = powers, root
-        (self.basis, self.by_u), (along, by_along) = (_raised(at[k], powers[:, k]) for k in range(2))
-        self.by_v, self.by_u, self.basis = self.basis * by_along, self.by_u * along, self.basis * along
+        (across, by_across), (along, by_along) = (_raised(places[k], powers[:, k]) for k in range(2))
+        self.basis, self.by_u, self.by_v = across * along, by_across * along, across * by_along
         q, r = np.linalg.qr(root[:, None] * self.basis)
         self.turn = np.linalg.inv(r)
-        self.inverse = self.turn @ (q.swapaxes(-1, -2) * root)
-        self.found = (self.inverse @ data[..., None])[..., 0]
-        self.left = data - (self.basis @ self.found[..., None])[..., 0]
+        self.inverse: np.ndarray = self.turn @ (q.swapaxes(-1, -2) * root)
+        self.terms: np.ndarray = (self.inverse @ data[..., None])[..., 0]
+        self.left: np.ndarray = data - (self.basis @ self.terms[..., None])[..., 0]
 
     def table(self, size: int) -> np.ndarray:
-        found = np.zeros((len(self.found), size, size))
-        found[:, self.powers[:, 0], self.powers[:, 1]] = self.found
-        return found
+        table = np.zeros((len(self.terms), size, size))
+        table[:, self.powers[:, 0], self.powers[:, 1]] = self.terms
+        return table
 
     def back(self, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By the data (Q, B, R) and by the places (2, Q, B, R).
@@ -456,7 +454,7 @@ class _Part:
         left = self.root**2 * self.left
         by_places = []
         for by in (self.by_u, self.by_v):
-            along, back = (by @ self.found[..., None])[..., 0], (by @ inner[..., None])[..., 0]
+            along, back = (by @ self.terms[..., None])[..., 0], (by @ inner[..., None])[..., 0]
             by_places.append(left * back - by_data * along)
         return by_data, np.stack(by_places)
 
@@ -478,8 +476,8 @@ def otf(polynomials: Tensor, shear: Tensor, points: int) -> Tensor:
     shear: (Q, B), in the units of their places; points: of the rules along and across.
     """
     with torch.no_grad():
-        corner, slope, found = _corners(polynomials[:2], shear)
-    dead = ~found
+        corner, slope, overlap = _corners(polynomials[:2], shear)
+    dead = ~overlap
     shear = torch.where(dead, 0.5, shear)
     pupil = polynomials[:2]
     ends = [_within(pupil, corner[0], corner[1] + side * shear) - 1 for side in (0.5, -0.5)]
@@ -503,9 +501,9 @@ def otf(polynomials: Tensor, shear: Tensor, points: int) -> Tensor:
     return torch.where(dead, 0.0, total)
 
 
-def _wave(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+def _wave(line: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
     """W and J at places (..., P) of lines (..., N, 5): p_x, p_y, W, and the slopes of p_x and p_y across."""
-    values, slopes = _along(line, at)
+    values, slopes = _along(line, place)
     (x, y), (x_u, y_u) = slopes[..., :2].unbind(-1), values[..., 3:].unbind(-1)
     return values[..., 2], (x_u * y - y_u * x).abs()
 
@@ -513,79 +511,76 @@ def _wave(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
 def _lines(polynomials: Tensor, place: Tensor) -> Tensor:
     """Polynomials (..., P, N, 5) along the lines at places (..., P) across, of p_x, p_y and W, and of p_x and p_y their
     slopes across."""
-    at, count = place.detach(), polynomials.shape[-1]
-    powers = _powers(at, count)
+    fixed_place, count = place.detach(), polynomials.shape[-1]
+    powers = _powers(fixed_place, count)
     first, second = _slope_of(powers), _slope_of(_slope_of(powers))
-    moved, fixed = (place - at)[..., None], polynomials.detach()
+    moved, fixed = (place - fixed_place)[..., None], polynomials.detach()
     line = powers @ polynomials + moved * (first @ fixed)
     steep = first @ polynomials[:2] + moved * (second @ fixed[:2])
     return torch.cat([line, steep]).movedim(0, -1)
 
 
-def _powers(at: Tensor, count: int) -> Tensor:
-    """at^k (..., N)."""
-    found = at.new_ones(*at.shape, count)
+def _powers(x: Tensor, count: int) -> Tensor:
+    """x^k (..., N)."""
+    powers = x.new_ones(*x.shape, count)
     for k in range(1, count):
-        torch.mul(found[..., k - 1], at, out=found[..., k])
-    return found
+        torch.mul(powers[..., k - 1], x, out=powers[..., k])
+    return powers
 
 
 def _slope_of(powers: Tensor) -> Tensor:
-    """k at^(k-1), of at^k; again, what follows from that."""
+    """k x^(k-1) of powers x^k (..., N); applied again, the second derivative."""
     k = torch.arange(powers.shape[-1], dtype=powers.dtype)
     return k * torch.roll(powers, 1, -1)
 
 
-def _along(line: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+def _along(line: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
     """Values and slopes (..., P, C) of polynomials (..., N, C) at places (..., P), with derivatives by both."""
     count, fixed = line.shape[-2], line.detach()
-    powers = _powers(at.detach(), count)
+    powers = _powers(place.detach(), count)
     k = torch.arange(1, count, dtype=line.dtype)[:, None]
     steep = k * line[..., 1:, :2]
     values, slopes = powers @ line, powers[..., :-1] @ steep
-    if not at.requires_grad:
+    if not place.requires_grad:
         return values, slopes
-    moved = (at - at.detach())[..., None]
+    moved = (place - place.detach())[..., None]
     bend = powers[..., :-2] @ (k[:-1] * steep.detach()[..., 1:, :])
     return values + moved * (powers[..., :-1] @ (k * fixed[..., 1:, :])), slopes + moved * bend
 
 
 def _rim(line: Tensor, place: Tensor, side: float) -> Tensor:
     """Where lines (..., P, N, 2) at places (..., P) across reach |p|² = 1, on one side."""
-    fixed, at = line.detach(), side * (safe_sqrt((1 - place * place).clamp_min(0.0)) + 0.05)
+    fixed, rim = line.detach(), side * (safe_sqrt((1 - place * place).clamp_min(0.0)) + 0.05)
     for _ in range(_NEWTON):
-        powers = _powers(at, line.shape[-2])[..., None, :]
+        powers = _powers(rim, line.shape[-2])[..., None, :]
         p, by = powers @ fixed, _slope_of(powers) @ fixed
         slope = 2 * (p * by).sum((-1, -2))
         slope = torch.where(slope == 0, 1.0, slope)
         step = ((p * p).sum((-1, -2)) - 1) / slope
-        at = at - step
+        rim = rim - step
         if float(step.abs().max()) < _CLOSE:
             break
-    p = _powers(at, line.shape[-2])[..., None, :] @ line
-    return at - ((p * p).sum((-1, -2)) - 1) / slope
+    p = _powers(rim, line.shape[-2])[..., None, :] @ line
+    return rim - ((p * p).sum((-1, -2)) - 1) / slope
 
 
-def _corners(pupil: Tensor, shear: Tensor) -> tuple[Tensor, tuple, Tensor]:
+def _corners(pupil: Tensor, shear: Tensor) -> tuple[Tensor, tuple[Pair, Pair], Tensor]:
     """Where both rims meet: middles (2, 2, Q, B), across and along, of both corners; slopes of |p|² there by these, of
-    the pupil ahead and behind; and for which there are any."""
+    the pupil ahead and behind; and whether the pupils overlap (Q, B)."""
     far = 0.5 * torch.clamp(shear, max=_WHOLE)
     across = safe_sqrt(1 - far * far)
-    at = torch.stack([torch.stack([-across, across]), torch.zeros(2, *shear.shape, dtype=shear.dtype)])
+    corner = torch.stack([torch.stack([-across, across]), torch.zeros(2, *shear.shape, dtype=shear.dtype)])
     for _ in range(_NEWTON):
-        sides = [_slopes(pupil, at[0], at[1] + side * shear) for side in (0.5, -0.5)]
-        (F, a, b), (G, c, d) = sides
+        (F, a, b), (G, c, d) = (_slopes(pupil, corner[0], corner[1] + side * shear) for side in (0.5, -0.5))
         det = a * d - b * c
         det = torch.where(det == 0, 1.0, det)
         step = torch.stack([d * (F - 1) - b * (G - 1), a * (G - 1) - c * (F - 1)]) / det
-        at = at - step.clamp(-0.2, 0.2)
+        corner = corner - step.clamp(-0.2, 0.2)
         if float(step.abs().max()) < _CLOSE:
             break
-    found = (step.abs().amax((0, 1)) < _CLOSE) & (at[0, 1] > at[0, 0]) & (shear < _WHOLE)
-    at = torch.where(
-        found, at, torch.stack([torch.tensor([-0.5, 0.5]).double(), torch.zeros(2).double()])[..., None, None]
-    )
-    return at, ((a, b), (c, d)), found
+    overlap = (step.abs().amax((0, 1)) < _CLOSE) & (corner[0, 1] > corner[0, 0]) & (shear < _WHOLE)
+    apart = torch.stack([torch.tensor([-0.5, 0.5]).double(), torch.zeros(2).double()])[..., None, None]
+    return torch.where(overlap, corner, apart), ((a, b), (c, d)), overlap
 
 
 def _slopes(pupil: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:

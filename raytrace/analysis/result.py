@@ -1,22 +1,26 @@
 """Results of analyses: a lens, columns, text and figure."""
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor
 
-from raytrace.analysis.setting import field_line, refuse_axis
+from raytrace.analysis.setting import NothingToShow, field_line, refuse_axis
 from raytrace.maths.numerics import broadcast_shape
-from raytrace.maths.result import Column, Result, Table, axis, rows
+from raytrace.maths.result import Column, Result, Table, axis, flat, rows
+from raytrace.system.lens import Lens
 
 _FINE = 321  # points of a curve over frequency or radius, when it is drawn
 
 
 class Analysis(Result):
-    """A value that holds `lens`, the lens as it was analysed, and mostly `fields` (2, F) in its kind of field."""
+    """A value that holds `lens`, the lens as it was analysed, and `fields` (2, F) in its kind of field, if any."""
 
     __slots__ = ()
+
+    lens: Lens
+    fields: Tensor
 
     #: The command, and the step of the points of a curve that the text lists.
     COMMAND: ClassVar[str] = ""
@@ -34,7 +38,7 @@ class Analysis(Result):
         table = {name: axis(values, 0, axes) for name, values in names.items()}
         return table | {name: axis(values, k, axes) for k, (name, values) in enumerate(others.items(), 1)}
 
-    def about(self) -> dict[str, str]:
+    def about(self) -> dict[str, Any]:
         """Entries of a document for the result as a whole."""
         return {}
 
@@ -46,11 +50,11 @@ class Analysis(Result):
         return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self.column(name).unit)}
 
     def document(self) -> dict:
-        found = {"analysis": self.COMMAND, **self.about(), "units": self.units(), "results": rows(self.columns())}
+        document = {"analysis": self.COMMAND, **self.about(), "units": self.units(), "results": rows(self.columns())}
         summary = self.summary()
-        return {**found, "summary": rows(summary)} if summary else found
+        return {**document, "summary": rows(summary)} if summary else document
 
-    def drawn(self) -> "Analysis":
+    def drawn(self) -> Self:
         """The same curves with points as close as a drawn line needs."""
         return self
 
@@ -83,9 +87,25 @@ class OverField(Analysis, abc.ABC):
     __slots__ = ()
 
     @abc.abstractmethod
-    def at(self, fields: Tensor) -> "OverField":
+    def at(self, fields: Tensor) -> Self:
         """The same analysis at other fields (2, F), which need not be in reach."""
 
-    def drawn(self) -> "OverField":
+    def drawn(self) -> Self:
         refuse_axis(self.fields)
         return self.at(field_line(self.fields))
+
+
+_HEADS = ("field_x", "field_y", "wavelength")
+
+Shown = TypeVar("Shown", bound=Analysis)
+
+
+def shown(result: Shown) -> Shown:
+    """The result. Raises NothingToShow if all its numbers are undefined."""
+    values = flat({name: column for name, column in result.columns().items() if name not in _HEADS})
+    if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
+        raise NothingToShow(
+            f"nothing to show: no number of {result.COMMAND.replace('-', ' ')} exists for this lens; `raytrace info` "
+            "shows whether it has a focal length and an image"
+        )
+    return result

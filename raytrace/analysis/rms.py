@@ -15,7 +15,7 @@ from raytrace.analysis.setting import Numbers, Points, primary_wavelength, scene
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import SAMPLINGS
-from raytrace.plotting.style import GREY, INK, array, styled
+from raytrace.plotting.style import GREY, INK, Figure, array, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
@@ -51,7 +51,7 @@ class RmsOverField(OverField):
 
     @property
     def quantity(self) -> str:
-        """What the RMS is of, "wavefront" or "spot"."""
+        """The quantity of the RMS, "wavefront" or "spot"."""
         return "spot" if self.strehl is None else "wavefront"
 
     def columns(self) -> dict[str, Tensor]:
@@ -78,12 +78,12 @@ class RmsOverField(OverField):
         return _rms(self.lens, fields, self.quantity == "spot", self.reference, self.pupil)
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """RMS over the field: all wavelengths together in black, each in its colour; Maréchal's limit dotted."""
         curves = self.drawn()
         waves = curves.quantity == "wavefront"
         quantity = "RMS wavefront error" if waves else "RMS spot radius"
-        _, panel = chart(5.6, 3.8, field_name(curves.lens), f"{quantity} ({'waves' if waves else 'µm'})")
+        panel = chart(5.6, 3.8, field_name(curves.lens), f"{quantity} ({'waves' if waves else 'µm'})")
         order = np.argsort(field_axis(curves))
         field, scale = field_axis(curves)[order], 1.0 if waves else 1e3
         by_wavelength(panel, curves, field, scale * array(curves.rms)[order], linewidth=1.2)

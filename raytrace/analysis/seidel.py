@@ -11,7 +11,7 @@ is his (Ā/A)(S3 + S4), written so that A may be 0. δn runs from the shortest w
 of OpticStudio, so that C1 of a single positive lens is negative; Welford's C has the other sign.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -20,9 +20,9 @@ from torch import Tensor
 from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import Number, value
 from raytrace.maths.result import Column, Table, cell
-from raytrace.plotting.style import FAINT, GREY, INK, array, field_colour, new_figure, styled
+from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 from raytrace.tracing.launch import is_at_infinity, paraxial_field
@@ -36,6 +36,8 @@ _SEIDEL = {
     "W311": "distortion", "W020": "axial colour", "W111": "lateral colour",
 }  # fmt: skip
 _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
+
+Pair = tuple[Number, Number]
 
 
 @value
@@ -101,7 +103,7 @@ class Seidel(Analysis):
         return tables
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """A row for each aberration, a bar for each surface and one for the sum, of the outermost field."""
         field = int(field_axis(self).argmax())
         values = {name: row for name, row in zip(self.names, array(self.contributions[:, field]), strict=True)}
@@ -126,7 +128,7 @@ class Seidel(Analysis):
         panels[-1].set(xlim=(0.3, surfaces + 2.2), xlabel="surface")
         figure.align_ylabels(panels)
         quantity = "coefficients" if self.kind in ("coefficients", "waves") else f"{self.kind} aberrations"
-        label = field_label(self.lens, array(self.fields)[:, field])
+        label = field_label(self.lens, self.fields[:, field].tolist())
         return finished(panels[0], self, f"Seidel {quantity} ({self.unit}), field {label}")
 
 
@@ -152,23 +154,23 @@ def seidel(
     need_axis(lens, "Seidel's theory", instead)
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
-            what = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
-            what = what if surface.phase is None else f"is {named(surface.phase)}"
-            raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r; {instead}")
+            defect = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
+            defect = defect if surface.phase is None else f"is {named(surface.phase)}"
+            raise ValueError(f"surface {number} {defect}: Seidel's theory is of even powers of r; {instead}")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)
     H = chief[1] * marginal[0] - marginal[1] * chief[0]
     names, convert, unit = KINDS[kind]
-    surfaces, (n, dispersion) = lens.surfaces[1:-1], _indices(lens)
+    surfaces, (signed_n, steps) = lens.surfaces[1:-1], _indices(lens)
     vertex = [vertex_curvature(surface) for surface in surfaces]
-    powers = [c * (behind - before) for c, before, behind in zip(vertex, n[:-1], n[1:], strict=True)]
-    gaps = [surface.thickness / behind for surface, behind in zip(surfaces, n[1:], strict=True)]
+    powers = [c * (behind - before) for c, before, behind in zip(vertex, signed_n[:-1], signed_n[1:], strict=True)]
+    gaps = [surface.thickness / behind for surface, behind in zip(surfaces, signed_n[1:], strict=True)]
     (y, omega), (y_bar, omega_bar) = (
         tuple(_per_surface(column, H) for column in zip(*ynu(*ray, powers, gaps), strict=True))
         for ray in (marginal, chief)
     )
-    c, n, dispersion = _per_surface(vertex, H), _per_surface(n, H), _per_surface(dispersion, H)
+    c, n, dispersion = _per_surface(vertex, H), _per_surface(signed_n, H), _per_surface(steps, H)
     departure = _per_surface([_departure(surface, v) for surface, v in zip(surfaces, vertex, strict=True)], H)
     before, behind = n[..., :-1], n[..., 1:]
     A, A_bar = (w[..., :-1] + before * h[..., :-1] * c for h, w in ((y, omega), (y_bar, omega_bar)))
@@ -224,33 +226,33 @@ def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
     return primary, [long - short for short, long in zip(shortest, longest, strict=True)]
 
 
-def _per_surface(numbers: list[Tensor], H: Tensor) -> Tensor:
+def _per_surface(numbers: Sequence[Tensor], H: Tensor) -> Tensor:
     """Numbers of the surfaces as (F, K)."""
     return torch.stack(torch.broadcast_tensors(*numbers, H)[:-1], -1)
 
 
-def third_order(marginal: tuple, chief: tuple, c, n: tuple, departure, H) -> tuple:
+def third_order(marginal: Pair, chief: Pair, c: Number, n: Pair, departure: Number, H: Number) -> tuple[Number, ...]:
     """S1 … S5 in mm at every surface, of tensors or dual numbers.
 
     marginal, chief: (y, ω) before the surfaces; c: vertex curvature, 1/mm; n: signed indices before and behind;
     departure: G, 1/mm³; H: mm.
     """
-    (y, omega), (y_bar, omega_bar), (n, n_behind) = marginal, chief, n
-    A, A_bar, step = omega + n * c * y, omega_bar + n * c * y_bar, n_behind - n
-    bending = y * ((omega - c * step * y) / (n_behind * n_behind) - omega / (n * n))
-    inverse, asphere, y2, y_bar2 = 1 / n_behind - 1 / n, 8 * departure * step, y * y, y_bar * y_bar
+    (y, omega), (y_bar, omega_bar), (before, behind) = marginal, chief, n
+    A, A_bar, step = omega + before * c * y, omega_bar + before * c * y_bar, behind - before
+    bending = y * ((omega - c * step * y) / (behind * behind) - omega / (before * before))
+    inverse, asphere, y2, y_bar2 = 1 / behind - 1 / before, 8 * departure * step, y * y, y_bar * y_bar
     return (
         -A * A * bending + asphere * y2 * y2,
         -A * A_bar * bending + asphere * y2 * y * y_bar,
         -A_bar * A_bar * bending + asphere * y2 * y_bar2,
         -H * H * c * inverse,
-        -(A_bar * A_bar * A_bar) * y * (1 / (n_behind * n_behind) - 1 / (n * n))
+        -(A_bar * A_bar * A_bar) * y * (1 / (behind * behind) - 1 / (before * before))
         + A_bar * y_bar * c * inverse * (H + A_bar * y)
         + asphere * y * y_bar2 * y_bar,
     )
 
 
-def departure_from_sphere(curvature, shape, quartic, vertex):
+def departure_from_sphere(curvature: Number, shape: Number, quartic: Number, vertex: Number) -> Number:
     """G in 1/mm³: the r⁴ term (1+k) c³/8 + a₂ of the sag less that of the sphere of the vertex curvature.
 
     shape: 1 + k; quartic: a₂, 1/mm³. Any number type.

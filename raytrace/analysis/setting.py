@@ -9,7 +9,6 @@ from torch.utils import _pytree as pytree
 
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import is_wrapped
-from raytrace.maths.result import flat
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import Lens, field_points, name_of_field, with_field_kind, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
@@ -25,7 +24,6 @@ Points = Tensor | Sequence | float | None
 Numbers = Tensor | Sequence[float] | float | None
 
 _DENSE = 65  # fields of a curve over the field that is drawn
-_HEADS = ("field_x", "field_y", "wavelength")
 
 
 class NothingToShow(RaytraceError, ValueError):
@@ -39,7 +37,7 @@ class Incomplete(RaytraceWarning):
 def setting(
     lens: Lens, fields: Points, wavelengths: Numbers, *, samples: int | None = None, every: bool = False
 ) -> tuple[Lens, Tensor]:
-    """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
+    """The lens at the wavelengths of an analysis, of equal weight and the first of them primary, and its fields (2, F).
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
     of those listed, or from `every` one, see `check_reach`; of batches of lenses and inside transforms of torch.func
@@ -47,15 +45,16 @@ def setting(
     Warns UnfilledStop.
     """
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
-    curve = fields is None and samples is not None
-    found = field_range(lens, samples) if curve else field_points(fields, like=lens)
-    warn_of_filling(lens, found)
-    if curve:
-        return lens, found
+    if fields is None and samples is not None:
+        curve = field_range(lens, samples)
+        warn_of_filling(lens, curve)
+        return lens, curve
+    points = field_points(fields, like=lens)
+    warn_of_filling(lens, points)
     hidden = any(isinstance(leaf, Tensor) and is_wrapped(leaf) for leaf in pytree.tree_leaves(lens))
     if not hidden and lens.count is None:
-        check_reach(lens, None if fields is None else found, every=every)
-    return lens, found
+        check_reach(lens, None if fields is None else points, every=every)
+    return lens, points
 
 
 def primary_wavelength(lens: Lens) -> Tensor:
@@ -99,30 +98,19 @@ def field_words(lens: Lens, field: Tensor) -> str:
     return f"{name_of_field(field)} {lens.fields.unit}"
 
 
-def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, what: str) -> None:
-    """Raise EmptySpot that names the first field (2, F) and wavelength without light, and where its rays end.
+def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, quantity: str) -> None:
+    """Raise EmptySpot, with the first field (2, F) and wavelength without light and the ends of its rays.
 
-    lit: (F, W); what: is not defined there.
+    lit: (F, W); quantity: that is not defined there.
     """
     if bool(lit.all()):
         return
     f, w = torch.nonzero(~lit)[0].tolist()
     wavelength = lens.wavelengths[w : w + 1]
-    found = ray_failures(lens, gauss_rings(6, **like(lens))[0], fields=fields[:, f : f + 1], wavelengths=wavelength)
-    lost = found.words(0, 0) if int(found.arrived) == 0 else "too few rays reach the sensor"
+    losses = ray_failures(lens, gauss_rings(6, **like(lens))[0], fields=fields[:, f : f + 1], wavelengths=wavelength)
+    lost = losses.words(0, 0) if int(losses.arrived) == 0 else "too few rays reach the sensor"
     where = f"field {field_words(lens, fields[:, f])}, {float(wavelength):g} µm"
-    raise EmptySpot(f"{where} has no {what}: {lost}; leave the field out")
-
-
-def shown(found):
-    """A result that has a number to show. Raises NothingToShow if there is none."""
-    values = flat({name: column for name, column in found.columns().items() if name not in _HEADS})
-    if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
-        raise NothingToShow(
-            f"nothing to show: no number of {found.COMMAND.replace('-', ' ')} exists for this lens; `raytrace info` "
-            "shows whether it has a focal length and an image"
-        )
-    return found
+    raise EmptySpot(f"{where} has no {quantity}: {lost}; leave the field out")
 
 
 def refuse_axis(fields: Tensor) -> None:
@@ -143,8 +131,8 @@ def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor, T
 
     And whether they exist (F,): no chief ray may reach a real image height.
     """
-    extent, found = object_field(lens, fields, axial_beam(lens))
+    extent, exist = object_field(lens, fields, axial_beam(lens))
     infinite = is_at_infinity(lens)
     described = torch.rad2deg(torch.atan(extent)) if infinite else extent
     kind = "angle" if infinite else "object_height"
-    return with_field_kind(lens, kind), described, extent, found
+    return with_field_kind(lens, kind), described, extent, exist

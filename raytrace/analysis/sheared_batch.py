@@ -5,6 +5,8 @@ polynomials and coordinates of the directions. Pupil points and waves are fitted
 Chebyshev polynomials. Apertures clip none of the rays: beams are those of the vignetting factors.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -59,7 +61,7 @@ class ShearedPupils:
 
     def _settled(self, lens: Lens) -> tuple[float, float]:
         """Make all choices for a degree: RMS in waves that its polynomials miss, and periods that the light covers."""
-        like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
+        like: dict[str, Any] = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
         rings, arms = self.degree // 2 + 1, 2 * self.degree + 4
         points, weights = gauss_rings(rings, arms, **like)
         rim = points[:, -arms:]
@@ -102,15 +104,15 @@ class ShearedPupils:
             chosen = torch.tensor([k for k, rule in enumerate(rules) if rule == points], device=blur.device)
             some = polynomials[:, chosen]
             both = torch.stack([some, some.mT], 1)  # along y, along x
-            found = otf(both.flatten(2, 4), shear[:, None].expand(2, len(chosen), -1, -1).flatten(1), points)
-            parts = parts.index_copy(1, chosen, found.unflatten(1, some.shape[1:4]))
+            otfs = otf(both.flatten(2, 4), shear[:, None].expand(2, len(chosen), -1, -1).flatten(1), points)
+            parts = parts.index_copy(1, chosen, otfs.unflatten(1, some.shape[1:4]))
         place = front.centre[:2].flip(0)
         shift = place - place[..., lens.primary_wavelength - 1, None]
         weights = wavelength_shares(lens) * front.energy.sum(-1)
         frequencies, weights = blur.new_tensor([self.frequency]), weights.repeat(2, 1, 1)
-        found = modulation(parts.flatten(0, 2)[..., None], frequencies, shift.flatten(0, 2), weights.flatten(0, 1))
-        tangential, sagittal = found[:, 0].unflatten(0, parts.shape[:3]).unbind(0)
-        return tuple(torch.where(arrive, part, torch.nan) for part in (tangential, sagittal))
+        curves = modulation(parts.flatten(0, 2)[..., None], frequencies, shift.flatten(0, 2), weights.flatten(0, 1))
+        tangential, sagittal = torch.where(arrive, curves[:, 0].unflatten(0, parts.shape[:3]), torch.nan).unbind(0)
+        return tangential, sagittal
 
     def _powers(self) -> list[tuple[int, int]]:
         return [(i, n - i) for n in range(self.degree + 1) for i in range(n + 1)]
@@ -130,11 +132,11 @@ class ShearedPupils:
             raised.append(torch.stack(terms, -1))
         basis = self.root[:, None] * raised[0][..., [i for i, _ in powers]] * raised[1][..., [j for _, j in powers]]
         wanted = torch.stack([*(p.expand_as(waves) for p in self.points), waves], -1)
-        found = applied(_LeastSquares, basis, self.root[:, None] * wanted)
+        fit = applied(_LeastSquares, basis, self.root[:, None] * wanted)
         size = self.degree + 1
-        place = torch.tensor([i * size + j for i, j in powers], device=found.device)
-        table = found.new_zeros(3, *found.shape[:-2], size * size).index_copy(-1, place, found.movedim(-1, 0))
-        by_power = found.new_tensor(_chebyshev(size))
+        place = torch.tensor([i * size + j for i, j in powers], device=fit.device)
+        table = fit.new_zeros(3, *fit.shape[:-2], size * size).index_copy(-1, place, fit.movedim(-1, 0))
+        by_power = fit.new_tensor(_chebyshev(size))
         return by_power.T @ table.unflatten(-1, (size, size)) @ by_power
 
 
@@ -147,19 +149,19 @@ class _LeastSquares(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(context, basis: Tensor, data: Tensor) -> Tensor:
+    def forward(context: Any, basis: Tensor, data: Tensor) -> Tensor:
         root, _ = torch.linalg.cholesky_ex(basis.mT @ basis)  # of a lens whose rays fail: numbers without meaning
-        found = torch.cholesky_solve(basis.mT @ data, root)
-        context.save_for_backward(basis, data, root, found)
-        return found
+        fit = torch.cholesky_solve(basis.mT @ data, root)
+        context.save_for_backward(basis, data, root, fit)
+        return fit
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(context, slope: Tensor) -> tuple[Tensor, Tensor]:
-        basis, data, root, found = context.saved_tensors
+    def backward(context: Any, slope: Tensor) -> tuple[Tensor, Tensor]:
+        basis, data, root, fit = context.saved_tensors
         inner = torch.cholesky_solve(slope, root)
         by_data = basis @ inner
-        return (data - basis @ found) @ inner.mT - by_data @ found.mT, by_data
+        return (data - basis @ fit) @ inner.mT - by_data @ fit.mT, by_data
 
 
 def _scene(lens: Lens, fields: Tensor) -> Scene:

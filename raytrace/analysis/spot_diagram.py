@@ -1,10 +1,12 @@
 """Spots: the spot of every field and wavelength on the sensor, of rays that are kept or of any number that are not."""
 
+import contextlib
 import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Literal
+from os import PathLike
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,8 +35,8 @@ from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, ima
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level, option
 
-_KERNELS = 64  # whose clear pupils are found at once
-_TRIED = 4096  # rays from which the cause is found where all fail
+_KERNELS = 64  # whose clear pupils are searched at once
+_TRIED = 4096  # rays that are traced again for the cause where all fail
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 _DOT_RINGS = 12  # 469 dots of a wavelength
 _INSET = 0.395  # of a panel's width
@@ -42,13 +44,9 @@ _MAGNIFY = 4.0  # a spot smaller than its panel by more than this has an enlarge
 _REFERENCES, _WEIGHTS = ("centroid", "chief"), ("area", "equal")
 
 
-def _of_each(name: str) -> property:
-    return property(lambda spots: getattr(spots.each, name), doc=f"(F, W): `{name}` of every spot.")
-
-
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with what a `Spot` has.
+    """Spots (F, W) of every field and wavelength on the sensor, (L, F, W) of a batch, mm, with the numbers of a `Spot`.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
@@ -69,16 +67,35 @@ class Spots(Result):
     reference: str = "centroid"
     weights: str = "area"
 
-    centroid = _of_each("centroid")
-    mean_square_radius = _of_each("mean_square_radius")
-    rms_radius = _of_each("rms_radius")
-    geometric_radius = _of_each("geometric_radius")
-    rays = _of_each("rays")
+    @property
+    def centroid(self) -> Tensor:
+        """(2, F, W) mm of every spot."""
+        return self.each.centroid
+
+    @property
+    def mean_square_radius(self) -> Tensor:
+        """(F, W) mm² of every spot."""
+        return self.each.mean_square_radius
+
+    @property
+    def rms_radius(self) -> Tensor:
+        """(F, W) mm of every spot."""
+        return self.each.rms_radius
+
+    @property
+    def geometric_radius(self) -> Tensor:
+        """(F, W) mm, the largest radius of every spot."""
+        return self.each.geometric_radius
+
+    @property
+    def rays(self) -> Tensor:
+        """(F, W), number of rays of every spot that arrive."""
+        return self.each.rays
 
     @property
     def launched(self) -> int:
-        """How many set out for each field and wavelength."""
-        return self.each.launched if self.arrivals is None else self.each.valid.shape[-1]
+        """Number of rays launched for each field and wavelength."""
+        return self.each.launched if isinstance(self.each, StreamedSpot) else self.each.valid.shape[-1]
 
     def columns(self) -> dict[str, Tensor]:
         x, y = (axis(component, 0, 2) for component in self.fields)
@@ -92,34 +109,34 @@ class Spots(Result):
         return {**unit, "results": [self._entry(*place) for place in places], **about}
 
     def _entry(self, *place: int) -> dict:
-        """What JSON says of the spot of a field and a wavelength, of a lens of a batch: null where no ray arrives."""
+        """The spot of a field and a wavelength, of a lens of a batch, for JSON: null where no ray arrives."""
         *of_lens, f, w = place
-        found = {"lens": of_lens[0]} if of_lens else {}
-        found |= {
+        entry: dict[str, Any] = {"lens": of_lens[0]} if of_lens else {}
+        entry |= {
             "field": numbers(self.fields[:, f]),
             "wavelength": number(self.lens.wavelengths[w]),
-            "centroid": numbers(self.centroid[:, *place]),
+            "centroid": numbers(self.centroid.movedim(0, -1)[place]),
             "rms_radius_um": number(1e3 * self.rms_radius[place]),
             "geometric_radius_um": number(1e3 * self.geometric_radius[place]),
             "rays": int(self.rays[place]),
         }
-        if self.arrivals is None:
-            found["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[place])
-        else:
-            found["vignetted"] = int((self.arrivals.status[place] == STATUS.index("vignetted")).sum())
-        return {**found, "launched": self.launched}
+        if isinstance(self.each, StreamedSpot):
+            entry["geometric_bound_um"] = number(1e3 * self.each.geometric_bound[place])
+        elif self.arrivals is not None:
+            entry["vignetted"] = int((self.arrivals.status[place] == STATUS.index("vignetted")).sum())
+        return {**entry, "launched": self.launched}
 
     def tables(self) -> list[Table]:
         """A row for each spot, and one for each field of several wavelengths together; of a batch one for each spot."""
         if self.lens.count is not None:
-            columns = self.columns()
-            return [Table({**columns, "lost": self.launched - columns.pop("rays")})]
+            table = self.columns()
+            return [Table({**table, "lost": self.launched - table.pop("rays")})]
         waves = [f"{wavelength:g}" for wavelength in self.lens.wavelengths.tolist()]
         several = len(waves) > 1
         together = [""] * several
         whole, each = _figures(self.whole), _figures(self.each)
         lost = (self.launched - each.pop("rays")).tolist()
-        columns = {
+        columns: dict[str, Tensor | Sequence] = {
             name: [text for place in row.tolist() for text in (*[f"{place:g}"] * len(waves), *together)]
             for name, row in zip(("field_x", "field_y"), self.fields, strict=True)
             if name == "field_y" or bool(row.any())
@@ -131,7 +148,7 @@ class Spots(Result):
         return [Table(columns)]
 
     @style.styled
-    def draw(self):
+    def draw(self) -> style.Figure:
         """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
         All panels have the same scale, are centred on the centroid over all wavelengths or on the chief ray of
@@ -144,11 +161,11 @@ class Spots(Result):
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
         radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
-        centre = self.whole.centroid.detach() if about is None else about  # what panels are centred on
+        centre = self.whole.centroid.detach() if about is None else about  # of the panels
         whole = dataclasses.replace(whole, centroid=centre, **radii)
-        fields, wavelengths = style.array(points), style.array(lens.wavelengths)
+        fields, wavelengths = style.array(points), lens.wavelengths.tolist()
         airy = float(airy_radius(lens))
-        half = panel_size(style.array(whole.geometric_radius), airy)
+        half = panel_size(whole.geometric_radius.tolist(), airy)
         columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
         rows = math.ceil(fields.shape[1] / columns)
         width = max(2.25 * columns, 5.6)
@@ -159,7 +176,7 @@ class Spots(Result):
                 panel.axis("off")
                 continue
             draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
-            panel.set_title(f"{field_title(lens)} {field_label(lens, fields[:, f])}")
+            panel.set_title(f"{field_title(lens)} {field_label(lens, fields[:, f].tolist())}")
         name = style.fill(lens.name, width, 11, bold=True) or "Lens"
         figure.suptitle(name, fontsize=11, fontweight="bold")
         legend = figure.legend(
@@ -173,13 +190,13 @@ class Spots(Result):
         legend.get_title().set(color=style.GREY, multialignment="center")
         return figure
 
-    def save(self, path) -> None:
+    def save(self, path: str | PathLike) -> None:
         """Write the rays as .csv: field, wavelength, pupil point, x, y, weight, status."""
         self._kept(option("output")).save(path)
 
-    def _kept(self, what: str) -> Arrivals:
+    def _kept(self, use: str) -> Arrivals:
         if self.arrivals is None:
-            raise ValueError(f"{what} needs the rays, and {option('rays')} keeps none: leave one out")
+            raise ValueError(f"{use} needs the rays, and {option('rays')} keeps none: leave one out")
         return self.arrivals
 
 
@@ -227,31 +244,31 @@ def spot(
                 f"{option('rays')} traces one lens, not a batch: leave it out, or choose a lens, as lens[0]"
             )
         _refuse_of_many(sampling, rings, points, reference, weights)
-        how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}
-        return _of_many(lens, fields, rays, "random" if sampling == "random" else "sobol", progress, **how)
+        rule = "random" if sampling == "random" else "sobol"
+        return _of_many(lens, fields, rays, rule, seed, ray_aiming, max_bytes, progress)
     like = lens.surfaces[-2].thickness
-    at, shares = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    pupil, shares = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     if weights == "equal":
         shares = torch.full_like(shares, 1 / len(shares))
     else:  # the rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss
-        at, shares = with_rim(at, shares)
+        pupil, shares = with_rim(pupil, shares)
     each = iter if progress is None else lambda work: progress(work, "field")
-    found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
-    if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
-        message = f"{unaimed} of {found.status.numel()} rays could not be aimed at their point of the stop"
+    traced = arrivals(lens, pupil, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
+    if unaimed := int((traced.status == STATUS.index("unaimed")).sum()):
+        message = f"{unaimed} of {traced.status.numel()} rays could not be aimed at their point of the stop"
         warnings.warn(message, LostRays, stacklevel=calling_level())
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
-    spots = spot_of(found.rays, shares, about=about)
-    warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
-    hits, valid = found.rays.position[:2].flatten(-2), found.rays.valid.flatten(-2)
+    spots = spot_of(traced.rays, shares, about=about)
+    warn_of_failures(lens, pupil, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
+    hits, valid = traced.rays.position[:2].flatten(-2), traced.rays.valid.flatten(-2)
     about = None if about is None else about[..., 0]
-    whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
+    whole = spot_of_points(hits, valid, traced.weight.flatten(), about=about)
     if (sampling, weights) == ("gauss", "area") and not bool(valid.all()):
         rings = SAMPLINGS["gauss"][2] if rings is None else rings
         spots, whole = _of_clear_pupils(
-            with_ray_aiming(lens, ray_aiming), fields, at[:, shares > 0], rings, about, spots, whole
+            with_ray_aiming(lens, ray_aiming), fields, pupil[:, shares > 0], rings, about, spots, whole
         )
-    return Spots(lens, fields, spots, whole, found, reference, weights)
+    return Spots(lens, fields, spots, whole, traced, reference, weights)
 
 
 #: Statistics of a `Spot` and the axes that each has by itself.
@@ -272,35 +289,39 @@ def _of_clear_pupils(
     lenses = clips.any(-1).nonzero()[:, 0]
     clips = clips[0] if lens.count is None else clips
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-    found = each, whole
+    clear_each, clear_whole = each, whole
     for some in lenses.split(max(1, size // fields.shape[1])):
         chosen = lens if lens.count is None else one_lens(lens, some)
-        spots = []
+        alone, joint = [], []
         for part in parts:
             rays, weights = clear_rays(scene_of(chosen, fields[:, part]), rings)
             hits, valid = rays.position[:2], rays.valid
             centre = None if about is None else about.reshape(2, -1, fields.shape[1])[:, some][..., part]
             together = hits.flatten(-2), valid.flatten(-2), (weights * shares[:, None]).flatten(-2)
-            alone = spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None])
-            spots.append((alone, spot_of_points(*together, about=centre)))
-        found = tuple(
-            dataclasses.replace(old, **{
-                name: _put(getattr(old, name), torch.cat([getattr(spot, name) for spot in new], axis + 1), axis, some)
-                for name, axis in _STATISTICS.items()
-            })
-            for old, new in zip(found, zip(*spots, strict=True), strict=True)
-        )  # fmt: skip
+            alone.append(spot_of_points(hits, valid, weights, about=None if centre is None else centre[..., None]))
+            joint.append(spot_of_points(*together, about=centre))
+        clear_each, clear_whole = _put(clear_each, alone, some), _put(clear_whole, joint, some)
 
-    def chosen(new: Spot, old: Spot, clips: Tensor) -> Spot:
-        numbers = {name: torch.where(clips, getattr(new, name), getattr(old, name)) for name in _STATISTICS}
-        return dataclasses.replace(new, **numbers)
+    def clear_where_clipped(new: Spot, old: Spot, clips: Tensor) -> Spot:
+        return _with_statistics(old, lambda name, _: torch.where(clips, getattr(new, name), getattr(old, name)))
 
-    return chosen(found[0], each, clips[..., None]), chosen(found[1], whole, clips)
+    return clear_where_clipped(clear_each, each, clips[..., None]), clear_where_clipped(clear_whole, whole, clips)
 
 
-def _put(numbers: Tensor, new: Tensor, axis: int, lenses: Tensor) -> Tensor:
-    """Numbers (…, lenses, …) in which some lenses have new ones; of one lens, without this axis, the new ones."""
-    return numbers.index_copy(axis, lenses, new) if new.dim() == numbers.dim() else new.squeeze(axis)
+def _with_statistics(spot: Spot, number_of: Callable[[str, int], Tensor]) -> Spot:
+    """The spot with other statistics, by their name and number of axes."""
+    numbers: dict[str, Any] = {name: number_of(name, axis) for name, axis in _STATISTICS.items()}
+    return dataclasses.replace(spot, **numbers)
+
+
+def _put(spots: Spot, parts: Sequence[Spot], lenses: Tensor) -> Spot:
+    """Spots (…, lenses, …) in which some lenses have those of parts of the fields; of one lens, those of the parts."""
+
+    def number_of(name: str, axis: int) -> Tensor:
+        numbers, new = getattr(spots, name), torch.cat([getattr(part, name) for part in parts], axis + 1)
+        return numbers.index_copy(axis, lenses, new) if new.dim() == numbers.dim() else new.squeeze(axis)
+
+    return _with_statistics(spots, number_of)
 
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:
@@ -318,14 +339,29 @@ def _refuse_of_many(sampling: str, rings: int | None, points: int | None, refere
         )
 
 
-def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray_aiming, max_bytes) -> Spots:
-    how = {"sampling": sampling, "seed": seed, "rim": _RIM, "ray_aiming": ray_aiming}
-    how["max_bytes"] = MAX_BYTES if max_bytes is None else max_bytes
-    if progress is None:
-        each, whole = stream_spots(lens, rays, fields=fields, **how)
-    else:
-        with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
-            each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
+def _of_many(
+    lens: Lens,
+    fields: Tensor,
+    rays: int,
+    sampling: str,
+    seed: int,
+    ray_aiming: str | None,
+    max_bytes: int | None,
+    progress: Callable | None,
+) -> Spots:
+    count = rays * fields.shape[1] * len(lens.wavelengths)
+    with contextlib.nullcontext() if progress is None else progress(count, "ray") as bar:
+        each, whole = stream_spots(
+            lens,
+            rays,
+            fields=fields,
+            sampling=sampling,
+            seed=seed,
+            rim=_RIM,
+            ray_aiming=ray_aiming,
+            max_bytes=MAX_BYTES if max_bytes is None else max_bytes,
+            progress=bar and bar.update,
+        )
     tried = sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
     warn_of_failures(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
     return Spots(lens, fields, each, whole)
@@ -380,7 +416,7 @@ def field_spots(
         return whole, seen
 
 
-def even_hexapolar(rings: int, **like) -> Tensor:
+def even_hexapolar(rings: int, **like: Any) -> Tensor:
     """Points (2, 1 + 3·rings·(rings + 1)) of equal areas of the pupil: the centre, and 6, 12, … on circles.
 
     The first j rings and the centre fill the radius √((1 + 3j(j + 1))/N) of N points in all; each ring halves its area.
@@ -403,7 +439,16 @@ def panel_size(radii: Sequence[float], airy: float) -> float:
     return 1.14 * max(1e-7, *(radius for radius in (*radii, airy) if math.isfinite(radius)))
 
 
-def draw_spot(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float) -> None:
+def draw_spot(
+    axes: style.Axes,
+    whole: Spot,
+    dots: Spot,
+    number: int,
+    *,
+    wavelengths: Sequence[float],
+    airy: float,
+    half: float,
+) -> None:
     """Draw the spot of one field into square axes of ± half mm about its centroid, with its radii below."""
     draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
     bar = style.round_length(0.62 * half)
@@ -417,21 +462,36 @@ def draw_spot(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.nda
 
 
 def draw_spot_to_scale(
-    axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+    axes: style.Axes,
+    whole: Spot,
+    dots: Spot,
+    number: int,
+    *,
+    wavelengths: Sequence[float],
+    airy: float,
+    half: float,
 ) -> None:
     """As `draw_spot`, on the scale of other panels; a spot much smaller than its panel is enlarged in a corner of it,
     with the factor below."""
-    look = {"wavelengths": wavelengths, "airy": airy}
-    draw_spot(axes, whole, dots, number, half=half, **look)
+    draw_spot(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
     size = panel_size([float(whole.geometric_radius[number])], airy)
     if bool(whole.rms_radius[number].isfinite()) and half > _MAGNIFY * size:
         inset = axes.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
-        draw_dots(inset, whole, dots, number, half=size, **look)
+        draw_dots(inset, whole, dots, number, wavelengths=wavelengths, airy=airy, half=size)
         inset.set_facecolor("#fbfbfb")
         inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
 
 
-def draw_dots(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float) -> None:
+def draw_dots(
+    axes: style.Axes,
+    whole: Spot,
+    dots: Spot,
+    number: int,
+    *,
+    wavelengths: Sequence[float],
+    airy: float,
+    half: float,
+) -> None:
     """The dots and the Airy circle, without words."""
     centre = style.array(whole.centroid[:, number])
     size = 2.0 if half > 4 * airy else 2.4
@@ -456,8 +516,8 @@ def draw_dots(axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.nda
         spine.set_visible(True)
 
 
-def wavelength_handles(wavelengths: np.ndarray, airy: float):
-    """What the legend says of colours and of the Airy circle."""
+def wavelength_handles(wavelengths: Sequence[float], airy: float) -> list[style.Line2D]:
+    """Entries of the legend: the colours of the wavelengths, and the Airy circle."""
     handles = [
         style.legend_entry(
             linestyle="", marker=style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)], color=colour,

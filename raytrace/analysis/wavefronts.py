@@ -1,9 +1,12 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import dataclasses
+import itertools
 import math
 import warnings
-from typing import Literal
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -17,12 +20,15 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import placed, value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
-from raytrace.plotting.style import GREY, INK, new_figure, number_text, styled
+from raytrace.plotting.style import GREY, INK, Figure, new_figure, number_text, styled
 from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene, symmetry
 from raytrace.tracing.wavefront import clear_wavefront, peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.words import calling_level
+
+if TYPE_CHECKING:  # slow to load
+    from matplotlib.colors import ListedColormap, Normalize
 
 _RINGS = 14, 56
 _GRID = 127
@@ -76,7 +82,7 @@ class WavefrontMap(Analysis):
         for field, values in zip(self.fields.T, self.coefficients, strict=True) if self.listed else ():
             terms = range(1, values.shape[-1] + 1)
             n, m = zip(*map(order, terms), strict=True)
-            columns = {
+            columns: dict[Any, Tensor | Sequence] = {
                 Column("j"): terms,
                 Column("n"): n,
                 Column("m"): m,
@@ -88,7 +94,7 @@ class WavefrontMap(Analysis):
         return tables
 
     @styled
-    def draw(self):
+    def draw(self) -> Figure:
         """A panel for each field (rows) and wavelength (columns), one scale for all; RMS, P-V, Strehl below.
 
         Maps of a single wavelength follow each other in lines of four. 0 is white; the scale ends with the maps.
@@ -102,8 +108,8 @@ class WavefrontMap(Analysis):
         axes = grid.reshape(-1, 1) if flows else grid
         opd = seen(self.opd, self.valid)
         colours, scale = _diverging(opd)
-        for row, w in np.ndindex(len(labels), count):
-            panel = axes[row][w]
+        for row, w in itertools.product(range(len(labels)), range(count)):
+            panel = axes[row, w]
             drawn = panel.imshow(opd[row, w], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
             panel.set(xticks=[], yticks=[])
             panel.spines[:].set_visible(False)
@@ -122,7 +128,7 @@ class WavefrontMap(Analysis):
         bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
         bar.set_label("OPD (waves)")
         bar.outline.set_visible(False)
-        return finished(grid[0][0], self, f"wavefront, {wavelength_label(self, 0)}" if flows else "wavefront")
+        return finished(grid[0, 0], self, f"wavefront, {wavelength_label(self, 0)}" if flows else "wavefront")
 
 
 def wavefront(
@@ -137,9 +143,9 @@ def wavefront(
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
     fields: y or (x, y); wavelengths: µm; size: pixels across a map; terms: number of Zernike terms, 37 by default;
-    numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. What a
-    wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the light
-    fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
+    numbering: "noll" (default) or "fringe"; the text lists the coefficients where one of them is given. Undefined
+    numbers are nan: all of them where no ray arrives, the coefficients, with a warning, where the light fills too
+    little of the pupil. Raises budget.OverBudget for more points than memory holds.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     F, W = fields.shape[1], len(lens.wavelengths)
@@ -149,17 +155,18 @@ def wavefront(
         helps="ask for a smaller {size}, or fewer fields or wavelengths",
     )
     zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
-    rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
-    parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
+    listed = bool(terms or numbering)
+    rule = partial(_map_of, size=size, terms=terms or 37, numbering=numbering or "noll", listed=listed)
+    parts = [rule(lens, some) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
     over = 0 if lens.count is None else 1
-    joined = {name: torch.cat([getattr(part, name) for part in parts], over) for name in _BY_FIELD}
-    found = dataclasses.replace(parts[0], fields=fields, **joined)
-    unknown = found.coefficients.detach()[..., 0].isnan() & found.rms.detach().isfinite()
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts], over) for name in _BY_FIELD}
+    maps = dataclasses.replace(parts[0], fields=fields, **joined)
+    unknown = maps.coefficients.detach()[..., 0].isnan() & maps.rms.detach().isfinite()
     for f in torch.nonzero(unknown.any(-1).reshape(-1, F).any(0))[:, 0].tolist():
         field = f"field {field_words(lens, fields[:, f])}"
         words = f"{field}: the light fills too little of the entrance pupil for Zernike coefficients"
         warnings.warn(words, Incomplete, stacklevel=calling_level())
-    return found
+    return maps
 
 
 def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str, listed: bool) -> WavefrontMap:
@@ -171,8 +178,11 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
     clear = clear_wavefront(view, *_RINGS)
     front = clear if clear.pupil.dim() == 2 else wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
     wave = 1e-3 * lens.wavelengths
-    of = (lambda numbers: numbers[0]) if lens.count is None else (lambda numbers: numbers)
-    opd, valid = placed(of(drawn.opd) / wave[:, None], inside), placed(of(drawn.valid), inside)
+
+    def by_lens(numbers: Tensor) -> Tensor:
+        return numbers[0] if lens.count is None else numbers
+
+    opd, valid = placed(by_lens(drawn.opd) / wave[:, None], inside), placed(by_lens(drawn.valid), inside)
     if folded:
         opd, valid = (torch.cat([half.flip(-1)[..., : size // 2], half], -1) for half in (opd, valid))
     return WavefrontMap(
@@ -181,16 +191,16 @@ def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str
         pupil=line,
         opd=opd,
         valid=valid,
-        coefficients=of(zernike_coefficients(front, terms, numbering)) / wave[:, None],
-        rms=of(rms(clear)) / wave,
-        peak_to_valley=of(peak_to_valley(dense)) / wave,
-        strehl=of(_strehl(view)),
+        coefficients=by_lens(zernike_coefficients(front, terms, numbering)) / wave[:, None],
+        rms=by_lens(rms(clear)) / wave,
+        peak_to_valley=by_lens(peak_to_valley(dense)) / wave,
+        strehl=by_lens(_strehl(view)),
         numbering=numbering,
         listed=listed,
     )
 
 
-def _grid(size: int, folded: bool, **like) -> tuple[Tensor, Tensor, Tensor]:
+def _grid(size: int, folded: bool, **like: Any) -> tuple[Tensor, Tensor, Tensor]:
     """A line of `size` points from -1 to 1, which of their pairs (y, x) lie in the pupil, and those (2, P).
 
     folded: of x the half from the middle on.
@@ -207,12 +217,12 @@ def _strehl(view: Scene) -> Tensor:
     for field in view.fields.split(1, 1):
         try:
             ratios.append(strehl(Scene(view.lens, field, view.wavelengths)))
-        except ValueError:  # a map of so many waves is still worth seeing
+        except ValueError:  # a map of so many waves is still shown
             ratios.append(view.wavelengths.new_full((view.shape[0], 1, view.shape[2]), torch.nan))
     return torch.cat(ratios, 1)
 
 
-def _diverging(values: np.ndarray):
+def _diverging(values: np.ndarray) -> tuple["ListedColormap", "Normalize"]:
     """Blue below 0, white at 0, red above, equally deep on either side; from the least to the largest of the values."""
     import matplotlib
     from matplotlib.colors import ListedColormap, Normalize

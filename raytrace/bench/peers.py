@@ -45,7 +45,7 @@ from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
 
@@ -210,7 +210,8 @@ def psf_methods(truth: Truth) -> list[Method]:
         be.set_backend("numpy")
         kernel, count = compute(optic, field, wavelength, grid, *sizes)
         kernel = torch.as_tensor(np.ascontiguousarray(kernel) * (energy / kernel.sum()))
-        return Kernels(kernel, grid, None, None, count)
+        unknown = kernel.new_full((3,), torch.nan)
+        return Kernels(kernel, grid, unknown[:2], unknown, count)
 
     methods = []
     for model, against, compute, sampling, choices in _PSFS:

@@ -26,7 +26,7 @@ from raytrace.tolerancing.criteria import Criterion, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.study import Study, View
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays, spot_of

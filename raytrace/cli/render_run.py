@@ -17,7 +17,8 @@ import raytrace
 from raytrace.cli.progress import Bar, Lines, progress
 from raytrace.cli.run import CommandError, open_lens, options_of, say
 from raytrace.cli.types import OutputFolder
-from raytrace.imaging.render import checked_depth, default_sensor, linearised
+from raytrace.imaging.image import linearised
+from raytrace.imaging.render import checked_depth, default_sensor
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.spectral_response import channel_names, read_response
 from raytrace.io.pictures import read_depth, read_levels

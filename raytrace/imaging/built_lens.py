@@ -16,7 +16,7 @@ from raytrace.system.tolerance_data import Compensator
 from raytrace.tolerancing.criteria import CRITERIA, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.study import sampling_of
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, Tolerances
 from raytrace.tracing.focus import along_normal, shift_to_focus
 
 _RINGS = 6  # of the pupil

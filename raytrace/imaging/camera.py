@@ -42,13 +42,14 @@ from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.field_kernels import (
     by_angle,
     check_model,
+    check_points,
     field_kernels,
     has_points,
     order_of,
     warn_of_dark_places,
 )
-from raytrace.imaging.image import as_picture, blur
-from raytrace.imaging.render import Rendering, check_points, element_in_stop, illumination_at, linearised, render
+from raytrace.imaging.image import as_picture, blur, linearised
+from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.result import plain
@@ -57,7 +58,7 @@ from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.image import decoded, transfer_functions
 from raytrace.imaging.pictures import Pictures, crop
-from raytrace.imaging.render import decoded
 from raytrace.imaging.restoration import (
     cross_spectrum,
     depth_invariant_wiener,

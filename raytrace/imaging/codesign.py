@@ -32,9 +32,9 @@ from raytrace.imaging.closed_form import (
     out_of_focus,
     patch_spectrum,
 )
+from raytrace.imaging.image import decoded
 from raytrace.imaging.network import RedNetShape, UNetShape, network
 from raytrace.imaging.pictures import Pictures, crop, draws
-from raytrace.imaging.render import decoded
 from raytrace.imaging.restoration import psnr, restore, restore_jointly
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
@@ -51,7 +51,7 @@ from raytrace.system.lens import Lens, with_object_distance, with_sensor_distanc
 from raytrace.system.parameter_paths import GLASS, parse_range
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import Tolerances
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers

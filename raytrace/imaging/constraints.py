@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from raytrace.materials.glass import Glass
+from raytrace.optimization.attained import EXACT, NotReached
 from raytrace.optimization.glass_choice import Pool
-from raytrace.optimization.least_squares import Linear, NoStep, Sides, State
-from raytrace.optimization.optimize import EXACT, NotReached
+from raytrace.optimization.least_squares import Linear, NoStep, Sides, SumOfSquares
 from raytrace.optimization.problem import Condition, Problem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
@@ -131,7 +131,7 @@ class Constraints:
         self._warn(state)
         return x
 
-    def _met(self, wanted: np.ndarray) -> tuple[np.ndarray, State]:
+    def _met(self, wanted: np.ndarray) -> tuple[np.ndarray, SumOfSquares]:
         """The end of the quadratic programs from the wanted variables on."""
         x, state = wanted, self._state(wanted, derivatives=False)
         for _ in range(_STEPS):
@@ -156,7 +156,7 @@ class Constraints:
             arrives = arrives if self._state(before + trial * (x - before), derivatives=False).lost else trial
         return before + arrives * (x - before)
 
-    def _state(self, x: np.ndarray, *, derivatives: bool) -> State:
+    def _state(self, x: np.ndarray, *, derivatives: bool) -> SumOfSquares:
         state = self.problem.state(x, derivatives)
         if self.limits is None:
             return state
@@ -191,7 +191,7 @@ class Constraints:
         known = missed > 0
         return missed[known], slopes[known]
 
-    def _warn(self, state: State) -> None:
+    def _warn(self, state: SumOfSquares) -> None:
         lost = f"{state.lost} rays of the rim fail" if state.lost else ""
         violation = _violation(state)
         beyond = f"conditions are violated by up to {violation:.3g}" if violation > EXACT else ""
@@ -201,7 +201,7 @@ class Constraints:
             warnings.warn(f"constraints {held or 'of the lens'}: {words}; {advice}", NotReached, calling_level())
 
 
-def _violation(state: State) -> float:
+def _violation(state: SumOfSquares) -> float:
     return float(max(np.abs(state.held).max(initial=0.0), state.limits.max(initial=0.0)))
 
 

@@ -461,6 +461,15 @@ def _of_sum_1(kernels: Tensor) -> Tensor:
     return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
 
 
+def check_points(points: Tensor, count: int) -> None:
+    """Raise ValueError for places (2, count) mm of another shape, or that are not finite."""
+    if tuple(points.shape) != (2, count):
+        raise ValueError(f"points of shape {tuple(points.shape)}: expected (2, {count}) mm, a place for each image")
+    if not bool(torch.isfinite(points.detach()).all()):
+        beyond = int((~torch.isfinite(points.detach())).any(0).sum())
+        raise ValueError(f"{beyond} of {count} points are nan or infinite: expected places of the sensor in mm")
+
+
 def warn_of_dark_places(kernels: Tensor, points: Tensor) -> None:
     """Warn DarkPlaces of kernels (B, C, h, w) at points (2, B) mm that are 0 in a channel."""
     dark = (kernels.detach() == 0).flatten(2).all(2).any(1)

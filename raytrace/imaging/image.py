@@ -43,6 +43,25 @@ def as_picture(picture: Tensor | np.ndarray, what: str = "picture") -> Tensor:
     return picture.to(torch.get_default_dtype()) / _WHITE[picture.dtype]
 
 
+def linearised(picture: Tensor | np.ndarray) -> Tensor:
+    """Numbers as they are; integers of 8 or 16 bits as the light that sRGB encodes (IEC 61966-2-1)."""
+    picture = torch.as_tensor(picture)
+    if picture.is_floating_point():
+        return picture
+    return decoded(as_picture(picture))
+
+
+def decoded(level: Tensor) -> Tensor:
+    """Light of sRGB levels from 0 to 1: the inverse of `encoded` (IEC 61966-2-1)."""
+    return torch.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+
+
+def encoded(light: Tensor) -> Tensor:
+    """sRGB levels of light, clipped to [0, 1] (IEC 61966-2-1)."""
+    light = light.clamp(0.0, 1.0)
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
 def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: str = "pixel") -> Tensor:
     """Convolution, by default over the region where the whole kernel lies inside the image; by FFT.
 

@@ -36,13 +36,14 @@ from raytrace.imaging.field_kernels import (
     by_angle,
     channel_moments,
     check_model,
+    check_points,
     field_kernels,
     order_of,
     radii,
     warn_of_dark_places,
     window_size,
 )
-from raytrace.imaging.image import as_picture, blur, depth_masks, extended_layers, occlusion
+from raytrace.imaging.image import as_picture, blur, depth_masks, encoded, extended_layers, linearised, occlusion
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.spectral_response import band
 from raytrace.imaging.varying_blur import bilinear, varying_blur
@@ -925,15 +926,6 @@ def patch_kernels(
     return illumination_at(lens, sensor, points)[:, None, None, None] * kernels if illumination else kernels
 
 
-def check_points(points: Tensor, count: int) -> None:
-    """Raise ValueError for places (2, count) mm of another shape, or that are not finite."""
-    if tuple(points.shape) != (2, count):
-        raise ValueError(f"points of shape {tuple(points.shape)}: expected (2, {count}) mm, a place for each image")
-    if not bool(torch.isfinite(points.detach()).all()):
-        beyond = int((~torch.isfinite(points.detach())).any(0).sum())
-        raise ValueError(f"{beyond} of {count} points are nan or infinite: expected places of the sensor in mm")
-
-
 def _check_distances(distances: Tensor, count: int) -> None:
     if distances.numel() != 1 and distances.shape != (count,):
         raise ValueError(
@@ -976,25 +968,6 @@ def default_sensor(
         raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
     pitch = 2 * reach / math.hypot(columns, rows)
     return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), offset=offset, **others)
-
-
-def linearised(picture: Tensor | np.ndarray) -> Tensor:
-    """Numbers as they are; integers of 8 or 16 bits as the light that sRGB encodes (IEC 61966-2-1)."""
-    picture = torch.as_tensor(picture)
-    if picture.is_floating_point():
-        return picture
-    return decoded(as_picture(picture))
-
-
-def decoded(level: Tensor) -> Tensor:
-    """Light of sRGB levels from 0 to 1: the inverse of `encoded` (IEC 61966-2-1)."""
-    return torch.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
-
-
-def encoded(light: Tensor) -> Tensor:
-    """sRGB levels of light, clipped to [0, 1] (IEC 61966-2-1)."""
-    light = light.clamp(0.0, 1.0)
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -8,6 +8,7 @@ picture are the same in any batch and in any process.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -195,7 +196,7 @@ class Sensor:
 
     # -- colours -------------------------------------------------------------------------------------------------------
 
-    @property
+    @functools.cached_property
     def channels(self) -> tuple[str, ...]:
         """Names of the channels, as many as there are."""
         return channel_names(self.response)

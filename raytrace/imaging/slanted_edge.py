@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.imaging.image import as_picture
-from raytrace.imaging.render import linearised
+from raytrace.imaging.image import as_picture, linearised
 from raytrace.maths.result import Column, Result, Table
 from raytrace.plotting.style import GREY, array, field_colour, new_figure, styled
 

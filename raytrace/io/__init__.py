@@ -92,10 +92,10 @@ class Format(NamedTuple):
         content: str | bytes,
         file: str,
         *,
-        catalogs: Sequence[Path] = (),
+        catalogs: Sequence[str | Path] = (),
         strict: bool = False,
         substitutes: Substitutes = NONE,
-        **options,
+        **options: int | None,
     ) -> tuple[Lens, ImportReport]:
         """The lens of a content and the report of its import.
 
@@ -301,7 +301,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(TILTED_OBJECT, place._replace(surface=0))
     plain, melts = with_melts(lens, path) if form.catalogs else (lens, None)
     with tempfile.TemporaryDirectory() as folder:
-        if melts is not None:  # as it will be found beside the file
+        if melts is not None:  # where readers look for it
             beside = Path(folder) / f"{melts.name}.agf"
             write_agf(melts, beside)
             catalogs = (beside, *catalogs)
@@ -310,7 +310,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         if melts is not None:
             beside = path.with_name(f"{melts.name.lower()}.agf")
             check_catalog(beside, place)
-            write_agf(melts, beside)  # first: a lens that is read finds its glasses
+            write_agf(melts, beside)  # first, so that no reader of the lens misses its glasses
         write_atomically(path, lambda file: file.write(content))
     except OSError as error:
         raise LensFileError(error.strerror or str(error), place) from error
@@ -319,6 +319,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
 def _checked(form: Format, lens: Lens, path: Path, catalogs: Sequence[str | Path]) -> bytes:
     """The content of the file of a lens, after it was read again; as `write_lens`."""
     place = Place(str(path))
+    assert form.write is not None, "one of the formats WRITTEN"
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
     try:
         again, _ = form.read(decode(content, place), str(path), catalogs=catalogs)

@@ -73,10 +73,11 @@ def listed_glass(
         if (other == NEAREST or nearest) and figures is not None:
             nd, vd = figures
             (glass,) = nearest_glasses((nd, vd), user=user, count=1)
-            off = f"its nd differs by {glass.nd_listed - nd:+.1e}, its Vd by {glass.abbe_listed - vd:+.2g}"
+            d_nd, d_vd = (glass.nd_listed or 0.0) - nd, (glass.abbe_listed or 0.0) - vd
+            off = f"its nd differs by {d_nd:+.1e}, its Vd by {d_vd:+.2g}"
             reason = f"the nearest to nd {nd:.7g}, Vd {vd:.5g} of the file"
             report.warn(f"{glass_words(glass)} is taken for the unknown glass {name}: {reason}; {off}", place)
-            report.glass(place.surface, name, f"{glass_words(glass)}, the nearest glass by nd and Vd")
+            report.glass(place, name, f"{glass_words(glass)}, the nearest glass by nd and Vd")
             return glass
         lacks = "the file has no nd and Vd to find the nearest glass by; " if nearest or other else ""
         hint = f"{lacks}specify a substitute by {option('substitute', f'{name}=OTHER')}"
@@ -91,7 +92,7 @@ def glass_words(glass: Glass) -> str:
 def _catalog_glass(
     name: str, catalogs: Sequence[str | Catalog], user: Sequence[Path], place: Place, report: Draft
 ) -> Glass:
-    """The glass of a name, as `find_glass` finds it, its warnings in the report. Raises UnknownGlass.
+    """The glass of a name by `find_glass`, with its warnings in the report. Raises UnknownGlass.
 
     Reports where a catalog that came with the lens differs from the shipped one of its name.
     """
@@ -99,12 +100,14 @@ def _catalog_glass(
         raise LensFileError(f"the glass {shown(name)} has {len(name)} characters; no glass has such a name", place)
     readable = []
     for catalog in catalogs:
-        try:
-            if isinstance(catalog, Catalog):
+        if isinstance(catalog, Catalog):
+            try:
                 catalog.find(name)
-            readable.append(catalog)
-        except CatalogError as error:
-            report.warn(f"the catalog {catalog.name} that came with the lens is left out: {error}", Place(report.file))
+            except CatalogError as error:
+                message = f"the catalog {catalog.name} that came with the lens is left out: {error}"
+                report.warn(message, Place(report.file))
+                continue
+        readable.append(catalog)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         glass = find_glass(name, catalogs=readable, user=user, where=str(place))
@@ -119,7 +122,7 @@ def _catalog_glass(
         message = f"{name} is that of the {glass.catalog} that came with the lens; its index differs from that of the"
         report.warn(f"{message} shipped {glass.catalog} by up to {gap:.1e}", place)
     alias = f" as {glass.listed_name}" if glass.listed_name and glass.listed_name.upper() != name.upper() else ""
-    report.glass(place.surface, name, f"{glass.catalog or 'user catalog'}{alias}")
+    report.glass(place, name, f"{glass.catalog or 'user catalog'}{alias}")
     return glass
 
 
@@ -146,10 +149,11 @@ def catalogs_of_lens(
     """
     came = catalogs_in_folder(report.file) if packed is None else packed
     stated = {path.stem.upper() for path in user_catalogs(user)}
-    catalogs, missing = [], []
+    catalogs: list[str | Catalog] = []
+    missing: list[str] = []
     for name in dict.fromkeys(names):
-        where, read = came.get(name.upper(), ("", None))
-        catalog = _came(name, where, read, report) if read and name.upper() not in stated else None
+        source = None if name.upper() in stated else came.get(name.upper())
+        catalog = None if source is None else _came(name, *source, report)
         catalogs.append(catalog or name)
         missing += [] if catalog else missing_catalogs([name], user=user)
     if missing:
@@ -197,9 +201,9 @@ def is_listed(glass: Glass) -> bool:
 
 
 def catalogs_needed(lens: Lens, user: Sequence[Path], file: str) -> tuple[str, ...]:
-    """The lens's catalogs, and those it lacks, such that every name finds the glass of the lens.
+    """The lens's catalogs, with further catalogs that its glasses need.
 
-    Raises LensFileError for a glass that its name does not find, or finds with other coefficients.
+    Raises LensFileError for a glass whose name is not found, or has other coefficients.
     """
     names = lens.catalogs
     for number, surface in enumerate(lens.surfaces):
@@ -382,7 +386,7 @@ def assemble(draft: LensDraft, file: str) -> Lens:
 def _refuse_overflow(lens: Lens, file: str) -> None:
     """Raise LensFileError where a number left the 64-bit range when it was converted to mm."""
 
-    def finite(numbers: list) -> bool:
+    def finite(numbers: Sequence[object]) -> bool:
         leaves = [
             torch.as_tensor(leaf, dtype=torch.float64) for leaf in pytree.tree_leaves(numbers) if leaf is not None
         ]
@@ -403,20 +407,23 @@ def _refuse_overflow(lens: Lens, file: str) -> None:
 
 
 def _in_order(data: OptimizationData | None) -> OptimizationData | None:
-    """Optimisation data with variables and solves by their places; a file does not keep another order."""
+    """Optimisation data with variables and solves in the order of surfaces, the only order that a file keeps."""
     if data is None:
         return None
 
-    def place(number: Vary | Solve) -> tuple:
-        return number.surface, number.quantity, number.configuration, number.operand or 0
+    def place(rule: Vary | Solve) -> tuple[int, str, int, int]:
+        return rule.surface, rule.quantity, rule.configuration, rule.operand or 0
 
-    variables, solves = (tuple(sorted(numbers, key=place)) for numbers in (data.variables, data.solves))
-    return dataclasses.replace(data, variables=variables, solves=solves)
+    variables, solves = sorted(data.variables, key=place), sorted(data.solves, key=place)
+    return dataclasses.replace(data, variables=tuple(variables), solves=tuple(solves))
 
 
 def changes(lens: Lens, again: Lens) -> list[str]:
     """The texts, configurations and optimisation data of a lens that its file does not bring back."""
-    pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
+    pairs: list[tuple[str, object, object]] = [
+        ("the title", lens.name, again.name),
+        ("a note", lens.notes, again.notes),
+    ]
     pairs += [(f"the catalog {name}", name, "") for name in lens.catalogs if name not in again.catalogs]
     surfaces = zip(lens.surfaces, again.surfaces, strict=True)
     pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(surfaces)]

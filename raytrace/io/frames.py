@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -62,7 +63,7 @@ def _column(name: str, cells: list[str]) -> list[str] | list[float]:
     return cells
 
 
-def _text(value: object) -> str:
+def _text(value: Any) -> str:
     """A cell or header value as a table file has it; numbers keep all their digits."""
     if value is None or value is pd.NA or (isinstance(value, float) and value != value):
         return ""

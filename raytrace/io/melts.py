@@ -1,4 +1,4 @@
-"""Melts: glasses with index errors as those of a glass catalog (.agf) that lies beside the file of their lens.
+"""Melts: glasses with index errors as those of a glass catalog (.agf) in the folder of the file of their lens.
 
 A lens file holds a glass by its name. A glass with errors is written by its `materials.glass.melt`, whose name ends in
 a melt number made of the figures of the glass, as N-SK16_M3F0A2: two melts of one name are the same glass. The catalog
@@ -10,16 +10,18 @@ import hashlib
 from pathlib import Path
 from types import MappingProxyType
 
+from torch import Tensor
+
 from raytrace.io.source import LensFileError, Place
 from raytrace.materials.agf import Catalog, CatalogError, read_text
 from raytrace.materials.environment import air_index, is_model, thermal
 from raytrace.materials.glass import WITH_ERRORS, Glass, NoMelt, melt
 from raytrace.system.lens import Lens
 
-#: First words of a catalog that was written with a lens, by which it may be replaced.
+#: First words of a catalog that was written with a lens, and may be replaced.
 _HEADING = "Melts of the lens file"
 
-#: The end of the name of such a catalog.
+#: The end of the name of a catalog of melts.
 _END = "-MELTS"
 
 
@@ -27,7 +29,7 @@ def with_melts(lens: Lens, path: Path) -> tuple[Lens, Catalog | None]:
     """The lens with glasses without errors that have the same indices, and the catalog of the melts among them.
 
     path: the file of the lens, after which the catalog is named; None where no glass needs a catalog.
-    Raises LensFileError for a batch of lenses, and for a glass that no formula of a catalog comes near.
+    Raises LensFileError for a batch of lenses, and for a glass that no formula of a catalog fits.
     """
     name = "-".join(path.stem.split()).replace("_", "-").upper() + _END
     glasses: dict[str, Glass] = {}
@@ -43,17 +45,16 @@ def with_melts(lens: Lens, path: Path) -> tuple[Lens, Catalog | None]:
             raise LensFileError(f"the index has the shape {shape}; a file holds one lens: write one of them", place)
         waves = _wavelengths(lens, glass)
         try:
-            found = melt(glass, waves)
+            fitted = melt(glass, waves)
         except NoMelt as error:
             raise LensFileError(str(error), place) from error
-        if is_model(found):
-            return found
+        if is_model(fitted):
+            return fitted
         figures = repr((glass.formula, glass.coefficients.tolist(), waves.tolist(), glass.records))
-        called = (
-            f"{'-'.join(glass.name.split()) or 'GLASS'}_M{hashlib.sha256(figures.encode()).hexdigest()[:5].upper()}"
-        )
-        found = dataclasses.replace(found, name=called, listed_name=called, catalog=name, comment=_comment(glass))
-        return glasses.setdefault(called, found)
+        number_of_melt = hashlib.sha256(figures.encode()).hexdigest()[:5].upper()
+        called = f"{'-'.join(glass.name.split()) or 'GLASS'}_M{number_of_melt}"
+        fitted = dataclasses.replace(fitted, name=called, listed_name=called, catalog=name, comment=_comment(glass))
+        return glasses.setdefault(called, fitted)
 
     surfaces = tuple(
         surface if (glass := plain(surface.glass, k)) is surface.glass else dataclasses.replace(surface, glass=glass)
@@ -69,7 +70,7 @@ def with_melts(lens: Lens, path: Path) -> tuple[Lens, Catalog | None]:
     return dataclasses.replace(lens, catalogs=(*catalogs, name)), Catalog(name, MappingProxyType(glasses), (heading,))
 
 
-def _wavelengths(lens: Lens, glass: Glass):
+def _wavelengths(lens: Lens, glass: Glass) -> Tensor:
     """The wavelengths (W,) µm of a lens as the formula of a glass takes them, in the air of its catalog."""
     if lens.environment is None or is_model(glass):
         return lens.wavelengths
@@ -83,7 +84,7 @@ def _comment(glass: Glass) -> str:
 
 
 def check_catalog(path: Path, place: Place) -> None:
-    """Refuse to replace a catalog that was not written with a lens. Raises LensFileError."""
+    """Raise LensFileError where the file is another catalog, which may not be replaced."""
     if not path.exists():
         return
     try:

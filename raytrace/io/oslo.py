@@ -29,7 +29,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from raytrace.io.assembly import BENT, ONWARD, RETURNED, LensDraft, assemble, listed_glass, poses_of
 from raytrace.io.source import (
@@ -59,7 +59,6 @@ from raytrace.io.source import (
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
-from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface, is_posed, medium_surfaces, power, signed, ynu
 
 # -- the commands -----------------------------------------------------------------------------------------------------
@@ -125,7 +124,7 @@ _NUMBERED = re.compile(r"(WV|WW|SNO)([1-9][0-9]{0,2})")
 class _Commands(Block):
     """The commands of one surface, and the wavelengths in force where its medium is defined, µm."""
 
-    def __init__(self, place: Place):
+    def __init__(self, place: Place) -> None:
         super().__init__(place)
         self.wavelengths: tuple[float, ...] = ()
 
@@ -187,7 +186,7 @@ def _sections(text: str, file: str, report: Draft) -> _Sections:
 class _Wavelengths:
     """The wavelengths as the commands of a file change them: WV lists them from the first on, WV2 sets the second."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.slots = dict(enumerate(_DEFAULT_WAVELENGTHS, 1))
         self.lens: list[float] = []
 
@@ -289,7 +288,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     _refuse_incomplete(parts)
     unit = parts.system.number("UNI", "mm in a lens unit", 1.0)
     if not _SMALLEST_UNIT <= unit <= _LARGEST_UNIT:
-        raise LensFileError(f"UNI is {unit:g}, expected the millimetres in a lens unit", parts.system.last("UNI").place)
+        raise LensFileError(f"UNI is {unit:g}, expected the millimetres in a lens unit", parts.system.place_of("UNI"))
     surfaces: list[Surface] = []
     for commands in parts.surfaces:
         surfaces.append(_surface(commands, surfaces, parts.surfaces, unit, catalogs, report))
@@ -309,7 +308,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     beam = 0.5 * aperture if kind == "entrance_pupil_diameter" else None
     draft = LensDraft(
         surfaces=_solved(parts, surfaces, waves[0], beam, unit, report),
-        stop=stop.surface,
+        stop=stop.surface or 0,
         aperture_kind=kind,
         aperture=aperture,
         field_kind=field_kind,
@@ -331,17 +330,16 @@ def _refuse_incomplete(parts: _Sections) -> None:
     refuse_few(surfaces)
     counts = [("LEN NEW", number(word, "surfaces", parts.head.place)) for word in _stated(parts)[1:]]
     end = parts.system.last("END")
-    counts += [("END", end.number(0, "number of the image"))] if end.words else []
+    counts += [("END", end.number(0, "number of the image"))] if end and end.words else []
     for keyword, count in counts:
         if count != last and not (keyword == "LEN NEW" and count > last):  # space for more surfaces
-            place = end.place if keyword == "END" else parts.head.place
+            place = parts.system.place_of("END") if keyword == "END" else parts.head.place
             raise LensFileError(f"{keyword} states that the image is surface {count:g}, but it is {last}", place)
-    if surfaces[-1].number("TH", "focus shift"):
-        shift = surfaces[-1].last("TH")
-        message = f"TH {shift.words[0]} of the image (a focus shift) is not modelled; add it to the thickness before"
-        raise UnsupportedSurface(message, shift.place)
-    for word, at in (*((word, at) for word in ("PU", "PY") for at in (0, last)), ("RFL", 0), ("RFH", 0)):
-        if record := surfaces[at].last(word):
+    if shift := surfaces[-1].number("TH", "focus shift"):
+        message = f"TH {shift:g} of the image (a focus shift) is not modelled; add it to the thickness before"
+        raise UnsupportedSurface(message, surfaces[-1].place_of("TH"))
+    for word, k in (*((word, k) for word in ("PU", "PY") for k in (0, last)), ("RFL", 0), ("RFH", 0)):
+        if record := surfaces[k].last(word):
             kind = "a solve" if word[0] == "P" else "a mirror"
             raise UnsupportedSurface(f"{word} ({kind}) of the object or the image is not modelled", record.place)
 
@@ -428,7 +426,8 @@ def _solved(
     beam: mm, height of the axial ray on surface 1 where the file gives it; None where only its direction is known,
     which suffices for a height of 0.
     """
-    surfaces, n = list(surfaces), []
+    surfaces = list(surfaces)
+    n: list[float] = []
     for k in medium_surfaces(surfaces)[:-1]:
         n.append(float(refractive_index(surfaces[k].glass, double(primary))))
         if not n[-1]:
@@ -442,14 +441,15 @@ def _solved(
         raise UnsupportedSurface(message, first.place)
     distance = float(surfaces[0].thickness)
     y, omega = (beam or 1.0, 0.0) if distance == math.inf else (distance, n[0])
-    powers, gaps = [], []
+    powers: list[float] = []
+    gaps: list[float] = []
     for k in range(1, len(surfaces) - 1):
         slope, height = solves[k]
         if slope:
             curvature = _solved_curvature(slope, n[k - 1], n[k], y, omega, beam)
             surfaces[k] = dataclasses.replace(surfaces[k], curvature=double(curvature))
             report.note(f"surface {k}: PU {slope.words[0]} solved again, curvature {curvature:.9g} in mm")
-        powers.append(float(power(surfaces[k], n[k - 1], n[k])))
+        powers.append(float(power(surfaces[k], double(n[k - 1]), double(n[k]))))
         if height:
             thickness = _solved_thickness(height, y, ynu(y, omega, powers[-1:], [])[1][1] / n[k], beam, unit)
             surfaces[k] = dataclasses.replace(surfaces[k], thickness=double(thickness))
@@ -530,7 +530,7 @@ def _surface(
     radius, apertures = _aperture(commands, unit)
     picked = _picked_up(commands, before, blocks, unit, report)
     terms = [commands.number(word, f"coefficient of r^{p}") / unit ** (p - 1) for word, p in _TERMS.items()]
-    shape = {
+    shape: dict[str, Any] = {
         "thickness": double(_thickness(commands, unit)),
         "curvature": nonzero(_curvature(commands) / unit),
         "conic": nonzero(commands.number("CC", "conic constant")),
@@ -562,8 +562,7 @@ def _thickness(commands: _Commands, unit: float) -> float:
     if commands.place.surface == 0 and distance >= _INFINITE:
         return math.inf
     if abs(distance) >= _INFINITE:
-        record = commands.last("TH")
-        raise LensFileError(f"TH is {shown(record.words[0])}; only the object may be at infinity", record.place)
+        raise LensFileError(f"TH is {distance:g}; only the object may be at infinity", commands.place_of("TH"))
     return distance * unit
 
 
@@ -582,7 +581,7 @@ def _aperture(commands: _Commands, unit: float) -> tuple[float | None, tuple[Ape
     return radius or None, (Aperture("circular", (0.0, radius), False, (0.0, 0.0)),) if checked and radius else ()
 
 
-def _poses(commands: _Commands, unit: float) -> dict[str, Pose]:
+def _poses(commands: _Commands, unit: float) -> dict[str, Any]:
     """The poses `before` and `after` of a surface, if any. Raises LensFileError, UnsupportedSurface."""
     moved = {word: value for word in _POSES if (value := commands.number(word, "tilt or decentre"))}
     bend, back = commands.last("BEN"), commands.last("RCO")
@@ -594,11 +593,11 @@ def _poses(commands: _Commands, unit: float) -> dict[str, Pose]:
     if commands.place.surface == 0:
         word = next(iter(moved))
         message = f"{word} (a tilted or decentred object) is not modelled"
-        raise UnsupportedSurface(message, commands.last(word).place)
+        raise UnsupportedSurface(message, commands.place_of(word))
     order = commands.integer("DT", "order of tilts and decentres", 1)
     if order not in (1, -1):
         message = f"DT is {order}, expected 1 (decentre, then tilt) or -1"
-        raise LensFileError(message, commands.last("DT").place)
+        raise LensFileError(message, commands.place_of("DT"))
     signs = {word: sign * (unit if word[0] == "D" else 1.0) for word, (_, sign) in _POSES.items()}
     numbers = {_POSES[word][0]: signs[word] * value for word, value in moved.items()}
     if bend:
@@ -625,9 +624,9 @@ _SOLVES = {"RD": "PU", "TH": "PY"}
 
 def _picked_up(
     commands: _Commands, before: Sequence[Surface], blocks: Sequence[_Commands], unit: float, report: Draft
-) -> dict:
+) -> dict[str, Any]:
     """The fields of a surface that are picked up from an earlier one. Raises LensFileError and UnsupportedSurface."""
-    fields = {}
+    fields: dict[str, Any] = {}
     for record in commands.all("PK"):
         kind = record.words[0].upper() if record.words else ""
         if kind not in _PICKUPS or len(record.words) not in (2, 2 + (kind != "GLA")):
@@ -646,7 +645,7 @@ def _picked_up(
                 message = f"PK GLA {record.words[1]} picks up a mirror, which is not modelled"
                 raise UnsupportedSurface(message, record.place)
             fields["glass"] = surface.glass
-            report.glass(record.place.surface, surface.glass.name, f"that of surface {source}")
+            report.glass(record.place, surface.glass.name, f"that of surface {source}")
         elif kind in ("TH", "THM"):
             fields["thickness"] = double(sign * float(surface.thickness) + added * unit)
         else:  # with the curvature the conic and the terms that belong to it
@@ -692,13 +691,13 @@ def _medium(commands: _Commands, user: Sequence[Path], report: Draft) -> Glass:
             message = f"GLA {shown(' '.join(record.words))}: {index:g} is no index; a glass by index and Abbe number"
             raise UnsupportedSurface(f"{message}, or by a code, is not modelled", place)
     if len(set(indices)) == 1:
-        report.glass(place.surface, name, f"constant index {indices[0]!r}")
+        report.glass(place, name, f"constant index {indices[0]!r}")
         return constant(indices[0], name)
     waves = commands.wavelengths[: len(indices)]
     if len(indices) > len(waves):
         raise LensFileError(f"{len(indices)} indices for {len(waves)} wavelengths", place)
     figures = f"indices {', '.join(map(repr, indices))} at {', '.join(map(repr, waves))} µm"
-    report.glass(place.surface, name, figures)
+    report.glass(place, name, figures)
     try:
         return from_table(waves, indices, name=name)
     except ValueError as error:

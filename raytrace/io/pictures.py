@@ -6,9 +6,11 @@ import sys
 import warnings
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
+from PIL.ImageFile import ImageFile
 
 from raytrace.files import read_bytes, write_atomically
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
@@ -80,7 +82,7 @@ def _picture(path: str | Path, *, low_bytes: bool = False) -> Image.Image:
     changes = []
     if (orientation := picture.info["orientation"]) != 1:
         changes.append(f"turned upright, by its EXIF orientation {orientation}")
-    if picture.has_transparency_data and picture.convert("RGBA").getextrema()[3][0] < 255:
+    if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[..., 3].min() < 255:
         changes.append("its transparent parts are shown on black")
     if changes and not low_bytes:
         warnings.warn(f"{path}: {'; '.join(changes)}", PictureChanged, stacklevel=calling_level())
@@ -95,19 +97,18 @@ def decoded(content: bytes, *, low_bytes: bool = False) -> Image.Image:
     """
     try:
         with warnings.catch_warnings(action="ignore"):
-            picture = Image.open(io.BytesIO(content), formats=_FORMATS)
-            width, height = picture.size
+            file = Image.open(io.BytesIO(content), formats=_FORMATS)
+            width, height = file.size
             count = width * height
             if count > _MOST_PIXELS or count > max(_FEW_PIXELS, _PIXELS_PER_BYTE * len(content)) or count < 1:
                 size = f"{width} × {height} pixels in {len(content)} bytes"
                 raise PictureError(f"{size}: damaged, or more than the {_MOST_PIXELS:.0e} that are read")
-            layout = _raw_mode(picture)
+            layout = _raw_mode(file)
             if low_bytes:
-                picture.tile = [_exchanged(tile) for tile in picture.tile]
-            picture.load()
-            orientation = picture.getexif().get(_ORIENTATION, 1)
-            if orientation != 1:  # the turned copy has no tags
-                picture = ImageOps.exif_transpose(picture)
+                file.tile = [_exchanged(tile) for tile in file.tile]
+            file.load()
+            orientation = file.getexif().get(_ORIENTATION, 1)
+            picture = file if orientation == 1 else ImageOps.exif_transpose(file)  # the turned copy has no tags
             picture.info |= {"raw_mode": layout, "orientation": orientation}
     except PictureError:
         raise
@@ -118,14 +119,14 @@ def decoded(content: bytes, *, low_bytes: bool = False) -> Image.Image:
     return picture
 
 
-def _raw_mode(picture: Image.Image) -> str:
+def _raw_mode(picture: ImageFile) -> str:
     """PIL's name of the layout of a file's pixels, as "RGB;16B"; "" if it has none."""
-    arguments = picture.tile[0][3] if picture.tile else ""
+    arguments: Any = picture.tile[0][3] if picture.tile else ""
     first = arguments[0] if isinstance(arguments, tuple) and arguments else arguments
     return first if isinstance(first, str) else ""
 
 
-def _exchanged(tile: tuple) -> tuple:
+def _exchanged(tile: Any) -> Any:
     """The tile with the order of its bytes of 16 bits exchanged."""
     arguments = tile[3]
     raw, rest = (arguments[0], arguments[1:]) if isinstance(arguments, tuple) else (arguments, None)
@@ -235,7 +236,7 @@ def read_depth(path: str | Path, depth_range: tuple[float, float] | None = None)
         return depth.astype(np.float64)
     tiff = Path(path).suffix.lower() in (".tif", ".tiff")
     levels = read_levels(path, 1)[0] if tiff else None
-    if tiff and levels.dtype.kind == "f":
+    if levels is not None and levels.dtype.kind == "f":
         if depth_range is not None:
             raise PictureError(f"{path}: floating-point distances in mm need no {option('depth_range')}: leave it out")
         return levels.astype(np.float64)
@@ -283,11 +284,10 @@ def _tiff(pixels: np.ndarray) -> bytes:
     pad = -4 * samples % 4
     numbers = struct.pack(f"<{2 * samples}H", *[32] * samples, *[3] * samples) + bytes(pad)
     content = pixels.tobytes()
-    at = {258: shorts, 339: shorts + 2 * samples}
     entries = [
-        (256, 4, 1, columns), (257, 4, 1, rows), (258, 3, samples, at[258]), (259, 3, 1, 1),
+        (256, 4, 1, columns), (257, 4, 1, rows), (258, 3, samples, shorts), (259, 3, 1, 1),
         (262, 3, 1, 2 if samples == 3 else 1), (273, 4, 1, start + pad), (277, 3, 1, samples), (278, 4, 1, rows),
-        (279, 4, 1, len(content)), (284, 3, 1, 1), (339, 3, samples, at[339]),
+        (279, 4, 1, len(content)), (284, 3, 1, 1), (339, 3, samples, shorts + 2 * samples),
     ]  # fmt: skip
     inline = {1: {258: 32, 339: 3}, 2: {258: 32 | 32 << 16, 339: 3 | 3 << 16}}.get(samples, {})  # up to 4 bytes
     entries = [(tag, kind, count, inline.get(tag, number)) for tag, kind, count, number in entries]

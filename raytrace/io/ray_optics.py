@@ -120,10 +120,10 @@ def part_of(value: object, path: str, place: Place) -> Part:
     """An object of the file, with its class in __instance_type__. Raises LensFileError for anything else."""
     type_ = value.get("__instance_type__") if isinstance(value, dict) else None
     attributes = value.get("attributes") if isinstance(value, dict) else None
-    is_typed = isinstance(type_, list) and len(type_) == 2 and all(isinstance(word, str) for word in type_)
-    if not is_typed or not isinstance(attributes, dict):
+    names = type_ if isinstance(type_, list) and all(isinstance(word, str) for word in type_) else []
+    if len(names) != 2 or not isinstance(attributes, dict):
         raise LensFileError(f"{path} is {shown(repr(value))}, expected an object with __instance_type__", place)
-    return Part(type_[0], type_[1], attributes, path, place)
+    return Part(names[0], names[1], attributes, path, place)
 
 
 def model_of(content: bytes, place: Place) -> Part:
@@ -264,7 +264,7 @@ def _poses(decentre: Part, unit: float) -> tuple[Pose | None, Pose | None]:
     numbers |= {"tilt_x": -euler[0], "tilt_y": -euler[1], "tilt_z": euler[2]}
     modelled = {name: number for name, number in numbers.items() if number}
     tilts = sum(name.startswith("tilt") for name in modelled)
-    axes = {"decenter": ONWARD, "dec and return": RETURNED, "bend": BENT}.get(kind)
+    axes = {"decenter": ONWARD, "dec and return": RETURNED, "bend": BENT}.get(kind, "")
     is_known = {ONWARD: True, RETURNED: tilts in (0, len(modelled)), BENT: tilts <= 1}
     if not modelled or is_known.get(axes):
         return poses_of(modelled, axes or ONWARD)
@@ -295,16 +295,16 @@ def _clear(aperture: Part, unit: float) -> Aperture:
 
 def _medium(medium: Part, wavelengths: list[float], catalogs: Sequence[Path], report: Draft) -> Glass:
     """Air, a constant index, a table, a model glass, or a glass of a catalog, by the class of a medium."""
-    name, kind, surface = medium.text("label").strip(), medium.kind, medium.place.surface
+    name, kind, place = medium.text("label").strip(), medium.kind, medium.place
     if kind == "Air":
         return AIR
     if kind in ("ConstantIndex", "Medium"):
         index = medium.number("n")
-        report.glass(surface, name, f"constant index {index!r}")
+        report.glass(place, name, f"constant index {index!r}")
         return AIR if index == 1 else constant(_positive(medium, index), name)
     if kind in ("InterpolatedMedium", "InterpolatedGlass"):
         waves, indices = [1e-3 * wave for wave in medium.numbers("wvls")], medium.numbers("rndx")
-        report.glass(surface, name, f"a formula for its {len(waves)} indices")
+        report.glass(place, name, f"a formula for its {len(waves)} indices")
         try:
             return from_table(waves, indices, name=name)
         except ValueError as error:
@@ -314,7 +314,7 @@ def _medium(medium: Part, wavelengths: list[float], catalogs: Sequence[Path], re
     if not medium.has("gname"):
         raise medium.unsupported(f"a medium of class {kind[:40]} is not modelled")
     maker = medium.module.rpartition(".")[2].upper()
-    return listed_glass(medium.text("gname"), catalogs=(maker,), user=catalogs, place=medium.place, report=report)
+    return listed_glass(medium.text("gname"), catalogs=(maker,), user=catalogs, place=place, report=report)
 
 
 def _positive(medium: Part, index: float) -> float:
@@ -340,7 +340,7 @@ def _model_glass(medium: Part, name: str, wavelengths: list[float], report: Draf
     glass = from_table(waves, indices, exact=len(lines), name=name)
     off = float((refractive_index(glass, waves) - indices).abs().max())
     figures = f"nd {medium.number('n', index):g}, Vd {medium.number('v', 0.0):g} by Buchdahl's formula"
-    report.glass(medium.place.surface, name, f"{figures}, met to {off:.1e} from {low:g} to {high:g} µm")
+    report.glass(medium.place, name, f"{figures}, met to {off:.1e} from {low:g} to {high:g} µm")
     return glass
 
 
@@ -387,9 +387,9 @@ def read(content: bytes, file: str, report: Draft, catalogs: Sequence[Path] = ()
     if len(weights) < len(waves):
         report.warn(f"{len(weights)} weights for {len(waves)} wavelengths; the others are taken as 1", region.place)
     surfaces = surfaces_of(model, sequence, unit, waves, catalogs, report)
-    for name, normal, of in (("temperature", 20.0, "°C"), ("pressure", 760.0, "mm Hg")):
+    for name, normal, scale in (("temperature", 20.0, "°C"), ("pressure", 760.0, "mm Hg")):
         if system.number(name, normal) != normal:
-            message = f"{name} {system.number(name):g} {of}: indices are those of the catalogs"
+            message = f"{name} {system.number(name):g} {scale}: indices are those of the catalogs"
             report.warn(message, system.place)
     shift = optics.part("defocus").number("focus_shift", 0.0) * unit if optics.has("defocus") else 0.0
     if shift:

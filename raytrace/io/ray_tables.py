@@ -6,6 +6,7 @@ import io
 import math
 import os
 import warnings
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,6 +15,9 @@ from raytrace.files import read_bytes
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.rays import COLUMNS, TRACED, Rays, start
 from raytrace.words import RaytraceError
+
+if TYPE_CHECKING:  # slow to load
+    import pandas
 
 #: Limit of bytes, some two million rays.
 LARGEST = 256 * 2**20
@@ -34,14 +38,15 @@ def read_rays(path: str | os.PathLike, lens: Lens) -> Rays:
     names = [name for name in (*COLUMNS, "wavelength") if name in table.columns]
     values = np.stack([_floats(table[name]) for name in names], axis=1).reshape(-1, len(names))
     _refuse_values(values, table[names], path)
-    rays = start(*torch.from_numpy(values[:, :6].T.copy()).split(3), torch.zeros(len(values), dtype=torch.float64))
+    position, direction = torch.from_numpy(values[:, :6].T.copy()).split(3)
+    rays = start(position, direction, torch.zeros(len(values), dtype=torch.float64))
     if "wavelength" not in names:
         return rays
     check_media(lens, torch.from_numpy(np.unique(values[:, 6])), where=str(path))
     return dataclasses.replace(rays, wavelength=torch.from_numpy(values[:, 6].copy()))
 
 
-def _parsed(path: str | os.PathLike):
+def _parsed(path: str | os.PathLike) -> "pandas.DataFrame":
     """The table as words, without blank lines, which the index still counts, and without columns that are empty."""
     import pandas
 
@@ -66,7 +71,7 @@ def _parsed(path: str | os.PathLike):
     return table.iloc[:, [k for k in range(table.shape[1]) if k not in empty]]
 
 
-def _refuse_columns(table, path: str | os.PathLike) -> None:
+def _refuse_columns(table: "pandas.DataFrame", path: str | os.PathLike) -> None:
     """Refuse a table without the columns of rays, a repeated column, and a column of numbers that is not known."""
     known, names = (*COLUMNS, "wavelength", *TRACED), list(table.columns)
     expected = f"{','.join(COLUMNS)}[,wavelength]"
@@ -84,7 +89,7 @@ def _refuse_columns(table, path: str | os.PathLike) -> None:
             raise RayTableError(f"{path}:1: column {name[:40]!r} is not known; {meant}")
 
 
-def _refuse_values(values: np.ndarray, words, path: str | os.PathLike) -> None:
+def _refuse_values(values: np.ndarray, words: "pandas.DataFrame", path: str | os.PathLike) -> None:
     """Refuse entries that are not finite, directions of length 0 and wavelengths not above 0, by their lines."""
     lines = words.index.to_numpy() + 2
     for row, column in np.argwhere(~np.isfinite(values))[:1]:
@@ -102,7 +107,7 @@ def _words(error: object) -> str:
     return " ".join(str(error).split())
 
 
-def _floats(column) -> np.ndarray:
+def _floats(column: "pandas.Series") -> np.ndarray:
     """The column as float64, every text read to the nearest double; nan where it is no number."""
     try:
         return column.to_numpy(dtype=np.float64, na_value=np.nan)
@@ -110,7 +115,7 @@ def _floats(column) -> np.ndarray:
         return np.array([_float(entry) for entry in column])
 
 
-def _float(entry: object) -> float:
+def _float(entry: Any) -> float:
     try:
         return float(entry)
     except (TypeError, ValueError):

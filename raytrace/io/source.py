@@ -1,7 +1,7 @@
 """The text of a lens file: its encoding, the numbers, texts and records in it, errors with file, line and surface; and
 the report of its import.
 
-Numbers and texts are written such that reading brings the same 64-bit numbers and the same characters back.
+A number or text that is written reads back as the same 64-bit number or the same characters.
 
 A glass is never replaced without request. `substitute` is a mapping {"SSK4": "SSK4A"}, or words as on the command line,
 "SSK4=SSK4A". "nearest" requests the glass of smallest
@@ -17,7 +17,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -72,7 +72,7 @@ class LensFileError(RaytraceError, ValueError):
     file, line, surface: the position in the file; None where that does not apply.
     """
 
-    def __init__(self, message: str, place: Place):
+    def __init__(self, message: str, place: Place) -> None:
         super().__init__(" ".join(f"{place}: {message}".split()))
         self.file, self.line, self.surface = place
 
@@ -82,7 +82,7 @@ class UnsupportedSurface(LensFileError):
 
 
 class LensFileWarning(RaytraceWarning):
-    """A lens file was read, but something in it was left out or assumed."""
+    """A lens file was read, but parts of it were left out, or assumptions were made."""
 
 
 def shown(text: str) -> str:
@@ -191,7 +191,7 @@ def is_infinite(text: str) -> bool:
     return bool(_INFINITE.fullmatch(text))
 
 
-def double(numbers: float | list) -> Tensor:
+def double(numbers: float | Tensor | Sequence) -> Tensor:
     """One or more numbers of a file as a 64-bit tensor."""
     return torch.as_tensor(numbers, dtype=torch.float64)
 
@@ -339,14 +339,24 @@ class Record(NamedTuple):
 class Block:
     """The records of the system or of one surface, by keyword."""
 
-    def __init__(self, place: Place):
+    def __init__(self, place: Place) -> None:
         self.place = place
         self.records: dict[str, list[Record]] = {}
+
+    @property
+    def surface(self) -> int:
+        """The number of the surface; 0 of the system."""
+        return self.place.surface or 0
+
+    def place_of(self, *keywords: str) -> Place:
+        """The place of the last record of these keywords, else that of the block."""
+        record = self.last(*keywords)
+        return self.place if record is None else record.place
 
     def all(self, *keywords: str) -> list[Record]:
         """Every record of these keywords, in the order of the file."""
         chosen = [record for keyword in keywords for record in self.records.get(keyword, ())]
-        return sorted(chosen, key=lambda record: record.place.line)
+        return sorted(chosen, key=lambda record: record.place.line or 0)
 
     def last(self, *keywords: str) -> Record | None:
         """The last record of the first of these keywords that is present."""
@@ -395,7 +405,7 @@ def refuse_few(surfaces: Sequence[Block]) -> None:
         raise LensFileError(message, surfaces[-1].place)
 
 
-def warn_of_repeats(blocks: list[Block], once, report) -> None:
+def warn_of_repeats(blocks: Sequence[Block], once: Callable[[str], bool], report: "Draft") -> None:
     """Warn of a keyword that occurs again in a block, for which `once` is true."""
     for block in blocks:
         for keyword, repeated in block.records.items():
@@ -420,13 +430,13 @@ class Substitutes:
     nearest: replace every unknown glass; formula: accept estimated indices of every glass.
     """
 
-    named: Mapping[str, str] = field(default_factory=dict)
+    by_name: Mapping[str, str] = field(default_factory=dict)
     nearest: bool = False
     formula: bool = False
 
     def of(self, name: str) -> str | None:
         """The substitute of a glass: a name, NEAREST or FORMULA; None where none was requested."""
-        return self.named.get(name.upper())
+        return self.by_name.get(name.upper())
 
     def takes_formula(self, name: str) -> bool:
         """Whether estimated indices of a glass are accepted."""
@@ -444,8 +454,8 @@ def substitutes_of(requested: Mapping[str, str] | str | Sequence[str] | None) ->
         pairs = list(requested.items())
     else:
         words = requested.split() if isinstance(requested, str) else list(requested)
-        pairs = [tuple(word.partition("=")[::2]) for word in words]
-    named, general = {}, {name for name, other in pairs if name in (NEAREST, FORMULA) and other == ""}
+        pairs = [(name, other) for name, _, other in (word.partition("=") for word in words)]
+    by_name, general = {}, {name for name, other in pairs if name in (NEAREST, FORMULA) and other == ""}
     for name, other in pairs:
         if other == "" and name in general:
             continue
@@ -453,8 +463,8 @@ def substitutes_of(requested: Mapping[str, str] | str | Sequence[str] | None) ->
             raise BadSubstitute(
                 f"{option('substitute')}: {name!r} for {other!r}; expected GLASS=OTHER, {NEAREST} or {FORMULA}"
             )
-        named[name.strip().upper()] = other.strip()
-    return Substitutes(named, NEAREST in general, FORMULA in general)
+        by_name[name.strip().upper()] = other.strip()
+    return Substitutes(by_name, NEAREST in general, FORMULA in general)
 
 
 # -- the report -------------------------------------------------------------------------------------------------------
@@ -462,7 +472,7 @@ def substitutes_of(requested: Mapping[str, str] | str | Sequence[str] | None) ->
 READ, IGNORED, UNKNOWN = "read", "ignored", "unknown"
 _TITLES = {READ: "read", IGNORED: "known and ignored", UNKNOWN: "unknown"}
 
-#: How many lines and surfaces of a keyword the report lists.
+#: Number of lines and surfaces of a keyword in the report, at most.
 _LISTED = 8
 
 
@@ -541,7 +551,7 @@ def operand_uses(merit: Sequence[Row], evaluated: Collection[str] | None) -> tup
     """The operands of a merit function by name; evaluated: names of those that are evaluated."""
     rows_by_name: dict[str, list[Row]] = {}
     for row in merit:
-        rows_by_name.setdefault(row.operand, []).append(row)
+        rows_by_name.setdefault(row.name, []).append(row)
     uses = []
     for name, rows in rows_by_name.items():
         status = KNOWN if evaluated is not None else "known"
@@ -608,7 +618,7 @@ class ImportReport(Result):
         columns = {"keyword": range(len(statuses)), "status": statuses, "count": counts}
         return {name: torch.tensor([*column]) for name, column in columns.items()}
 
-    def words(self) -> dict[str, list[str]]:
+    def words(self) -> dict[str, Sequence[str]]:
         return {"keyword": [keyword.name for keyword in self.keywords], "status": [*_TITLES]}
 
     def __str__(self) -> str:
@@ -616,9 +626,9 @@ class ImportReport(Result):
         lines += [f"  warning: {warning}" for warning in (*self.warnings, *self.geometry)]
         lines += [f"  note: {note}" for note in self.notes]
         if self.wavelengths:
-            chosen, count = self.primary_wavelength, len(self.wavelengths)
+            primary, count = self.primary_wavelength, len(self.wavelengths)
             lines += [
-                f"  primary wavelength: number {chosen} of {count}, {self.wavelengths[chosen - 1]:g} µm",
+                f"  primary wavelength: number {primary} of {count}, {self.wavelengths[primary - 1]:g} µm",
                 f"  ray aiming: {self.ray_aiming} ({RAY_AIMING[self.ray_aiming]})",
             ]
         for status, title in _TITLES.items():
@@ -649,10 +659,11 @@ class ImportReport(Result):
         return lines + [f"    not read: {line}" for line in self.unread_tolerances]
 
 
-def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:
+def _wrapped(words: Iterable[str]) -> list[str]:
+    """Lines of at most 100 characters with words between commas."""
     lines, line = [], "   "
     for word in words:
-        if len(line) + len(word) + 2 > width:
+        if len(line) + len(word) + 2 > 100:
             lines.append(line)
             line = "   "
         line += f" {word},"
@@ -700,9 +711,9 @@ class Draft:
         """Report an assumption or a loss at a place."""
         self.warnings.append((text, place))
 
-    def glass(self, surface: int, name: str, source: str) -> None:
-        """Report the source of a medium."""
-        self.glasses.append(GlassSource(surface, name, source))
+    def glass(self, place: Place, name: str, source: str) -> None:
+        """Report the source of the medium behind the surface of a place."""
+        self.glasses.append(GlassSource(place.surface or 0, name, source))
 
     def finished(self, *, strict: bool) -> ImportReport:
         """The report. Raises LensFileError for the first warning if `strict`."""
@@ -716,7 +727,7 @@ class Draft:
                 times = "" if count == 1 else f" ({count} times)"
                 label = name if name.startswith("member ") else f"keyword {name}"
                 self.warn(f"unknown {label}{times}: left out", place._replace(surface=None))
-        for name in self.substitutes.named:
+        for name in self.substitutes.by_name:
             if name not in self.substituted:
                 message = f"a substitute for the glass {name} was requested, which is not in the file"
                 self.warn(message, Place(self.file))

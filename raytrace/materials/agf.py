@@ -23,10 +23,10 @@ _KEYWORDS = {"CC", "NM", "GC", *_NUMERIC}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _LARGEST_FILE = 16 * 2**20
 
-#: More glasses than any catalog has; all makers together list some thousands.
+#: A catalog of more glasses is refused; all makers together list some thousands.
 MOST_GLASSES = 20_000
 
-#: Characters that no text has, and a name; both are sought in catalogs of megabytes, so without regard to lines.
+#: Characters that no text has, and the record of a name; both are searched without regard to lines, for speed.
 _BINARY = bytes({*range(32)} - {*b"\t\n\v\f\r"})
 _NAME = re.compile(r"NM[ \t]+(\S+)")
 
@@ -36,7 +36,7 @@ class CatalogError(RaytraceError, ValueError):
 
 
 class CatalogWarning(RaytraceWarning):
-    """A catalog was read, but something in it was left aside."""
+    """A catalog was read, but parts of it were ignored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,10 @@ class Catalog:
     comments: tuple[str, ...] = ()
 
     def find(self, name: str) -> Glass | None:
-        """The glass of this name, or of this name but for upper and lower case; None if there is none."""
-        if name not in self.glasses:
-            name = next((listed for listed in self.glasses if listed.upper() == name.upper()), None)
-        return None if name is None else self.glasses[name]
+        """The glass of a name, else of a name that differs in upper and lower case alone; None if there is none."""
+        alike = (listed for listed in self.glasses if listed.upper() == name.upper())
+        key = name if name in self.glasses else next(alike, None)
+        return None if key is None else self.glasses[key]
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -66,7 +66,7 @@ def read_agf(path: str | Path) -> Catalog:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a catalog's file, however it is encoded. Raises CatalogError."""
+    """The text of a catalog's file, in any encoding of `files.encoding`. Raises CatalogError."""
     path = Path(path)
     try:
         content = read_bytes(path, _LARGEST_FILE)
@@ -83,29 +83,29 @@ def decode(content: bytes, path: str | Path) -> str:
     except UnicodeDecodeError as error:
         raise CatalogError(f"{path}: damaged {codec.upper()} text at byte {error.start}; cut off?") from error
     plain = text.encode()
-    if len(plain.translate(None, _BINARY)) < len(plain):
-        binary = re.search(f"[{re.escape(_BINARY.decode())}]", text)
+    if len(plain.translate(None, _BINARY)) < len(plain) and (binary := re.search(f"[{_BINARY.decode()}]", text)):
         line = text.count("\n", 0, binary.start()) + 1
         raise _fault(path, line, f"binary data (byte {ord(binary[0]):#04x})", "the text of an AGF")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _names(text: str) -> list[tuple[str, int]]:
-    """The name of every glass of a text, and where its record begins."""
+    """The name of every glass of a text, and the place where its record begins."""
     records = ((match[1], match.start()) for match in _NAME.finditer(text))
-    return [(name, at) for name, at in records if not text[text.rfind("\n", 0, at) + 1 : at].strip()]
+    return [(name, start) for name, start in records if not text[text.rfind("\n", 0, start) + 1 : start].strip()]
 
 
-class _Listing(Mapping):
-    """The glasses of a catalog's text by their names, each parsed when it is asked for; raises CatalogError then."""
+class _Listing(Mapping[str, Glass]):
+    """The glasses of a catalog's text by their names, each parsed at its first use; raises CatalogError then."""
 
-    def __init__(self, text: str, catalog: str, path: Path):
+    def __init__(self, text: str, catalog: str, path: Path) -> None:
         self._text, self._catalog, self._path = text, catalog, path
         starts = _names(text)
         _refuse_many(len(starts), path)
         ends = [*(start for _, start in starts), len(text)][1:]
         self.header = text[: starts[0][1]] if starts else ""
-        line, self._places = 1 + self.header.count("\n"), {}
+        line = 1 + self.header.count("\n")
+        self._places: dict[str, tuple[int, int, int]] = {}
         for (name, start), end in zip(starts, ends, strict=True):
             self._places.setdefault(name, (start, end, line))
             line += text.count("\n", start, end)
@@ -129,9 +129,9 @@ class _Listing(Mapping):
 
 
 def listed(text: str, path: str | Path) -> Catalog:
-    """The catalog of a text as `parse_agf` reads it, but that a glass is parsed when it is asked for.
+    """The catalog of a text as of `parse_agf`, each glass parsed at its first use.
 
-    Raises CatalogError where there is none, or more than MOST_GLASSES; of a damaged glass when it is asked for.
+    Raises CatalogError for no glasses, or more than MOST_GLASSES; for a damaged glass at its first use.
     """
     path = Path(path)
     glasses = _Listing(text, path.stem.upper(), path)
@@ -151,7 +151,9 @@ def parse_agf(text: str, path: str | Path) -> Catalog:
     """The catalog written in the text of an AGF file; `path` gives its name and its place in messages."""
     path = Path(path)
     _refuse_many(len(_names(text)), path)
-    name, comments, glasses = path.stem.upper(), [], {}
+    name = path.stem.upper()
+    comments: list[str] = []
+    glasses: dict[str, Glass] = {}
     unknown: dict[str, int] = {}
     for block in _blocks(_records(text, unknown)):
         comments += [rest for _, keyword, rest in block if keyword == "CC" and rest]
@@ -173,8 +175,8 @@ def parse_agf(text: str, path: str | Path) -> Catalog:
     return Catalog(name, MappingProxyType(glasses), tuple(comments))
 
 
-def _fault(path: Path, line: int, found: str, expected: str, fix: str = "") -> CatalogError:
-    return CatalogError(f"{path}:{line}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
+def _fault(path: Path, line: int, text: str, expected: str, fix: str = "") -> CatalogError:
+    return CatalogError(f"{path}:{line}: found {text}, expected {expected}" + (f"; {fix}" if fix else ""))
 
 
 def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tuple[int, str, str]]:
@@ -183,7 +185,8 @@ def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tup
     A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
     status; the first words of other lines are noted in `unknown`, with their lines.
     """
-    line_of_record, keyword, parts = 0, "", []
+    line_of_record, keyword = 0, ""
+    parts: list[str] = []
     for line, content in enumerate(re.split(r"\r\n|\r|\n", text), first):
         word, *rest = content.split(maxsplit=1) or [""]
         if not word or word.startswith("!"):
@@ -219,17 +222,18 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
     name = words[0]
     number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=("-1",))
-    formula = BY_NUMBER.get(number)
+    formula = BY_NUMBER.get(int(number)) if number.is_integer() else None
     if formula is None:
         raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
     line, text = _only(block, "CD", name, path)
     coefficients, count = _numbers(text.split(), path, line), FORMULAS[formula].count
     if len(coefficients) < count:
-        found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
-        raise _fault(path, line, found, expected, "is the line cut off?")
+        figures, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
+        raise _fault(path, line, figures, expected, "is the line cut off?")
     line_of_range, text = _only(block, "LD", name, path)
-    span = _numbers(text.split(), path, line_of_range)[:2]
-    if span != (0.0, 0.0) and (len(span) < 2 or not 0 < span[0] < span[1]):
+    shortest, longest, *_ = (*_numbers(text.split(), path, line_of_range), math.nan, math.nan)
+    is_unknown = shortest == longest == 0
+    if not is_unknown and not 0 < shortest < longest:
         expected = "the shortest and the longest wavelength in µm"
         raise _fault(path, line_of_range, f"LD {text[:40]} for {name}", expected)
     comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
@@ -240,8 +244,8 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         formula=formula,
         coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
-        wavelength_range=None if span == (0.0, 0.0) else span,
-        status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
+        wavelength_range=None if is_unknown else (shortest, longest),
+        status=_STATUSES.get(int(flags[1]), "") if len(flags) > 1 and flags[1].is_integer() else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
         alternatives=tuple(listing[1].replace(",", " ").split()) if listing else (),
@@ -256,9 +260,9 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
 
 
 def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
-    """The one record of a keyword that every glass must have, (line, text).
+    """The record of a keyword that every glass must have once, (line, text).
 
-    A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
+    A second record shows that a NM line is lost: the figures are then those of the next glass.
     """
     records = [(line, text) for line, key, text in block if key == keyword]
     if not records:
@@ -270,14 +274,14 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
 
 
 def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: Sequence[str] = ()) -> tuple[float, ...]:
-    """Numbers of a record; blanks: the figures in place of "-" and "_", the last for all further words."""
+    """Numbers of a record; blanks: the figures in place of "-" and "_", the last figure for all further words."""
     try:  # a catalog has some ten thousand of them
         numbers = tuple(map(float, words))
     except ValueError:
         numbers = (math.nan,)
     if math.isfinite(sum(numbers)) and "_" not in "".join(words):
         return numbers
-    numbers = []
+    figures: list[float] = []
     for k, word in enumerate(words):
         if blanks and word in ("-", "_"):
             word = blanks[min(k, len(blanks) - 1)]
@@ -288,8 +292,8 @@ def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: Sequence[st
         if not math.isfinite(number) or "_" in word:
             fix = "write decimals with a point" if "," in word else "is the line damaged?"
             raise _fault(path, line, repr(word[:40]), "a finite number", fix)
-        numbers.append(number)
-    return tuple(numbers)
+        figures.append(number)
+    return tuple(figures)
 
 
 # -- writing ----------------------------------------------------------------------------------------------------------
@@ -315,12 +319,13 @@ def _glass_lines(name: str, glass: Glass) -> list[str]:
     number = FORMULAS[glass.formula].number if glass.formula in FORMULAS else None
     if number is None or len(name.split()) != 1:
         raise ValueError(f"glass {name!r} with formula {glass.formula!r} cannot be written as AGF")
-    n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed)
+    n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed or 0.0)
     code = f"{round(n * 1000) % 1000:03d}{round(v * 10) % 1000:03d}"
     status = next((number for number, status in _STATUSES.items() if status == glass.status), -1)
     coefficients = glass.coefficients.tolist()
-    figures = [("CD", coefficients + [0.0] * (10 - len(coefficients))), ("LD", glass.wavelength_range or (0.0, 0.0))]
-    records = sorted([*glass.records, *figures], key=lambda record: _NUMERIC[record[0]])
+    padded = (*coefficients, *[0.0] * (10 - len(coefficients)))
+    figures = [*glass.records, ("CD", padded), ("LD", glass.wavelength_range or (0.0, 0.0))]
+    records = sorted(figures, key=lambda record: _NUMERIC[record[0]])
     return [
         f"NM {name} {number} {code} {_spell(n)} {_spell(v)} 0 {status} -1",
         *[f"GC {comment}" for comment in glass.comment.split("\n") if comment],

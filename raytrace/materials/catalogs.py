@@ -82,7 +82,7 @@ class UnknownGlass(RaytraceError, LookupError):
         suggestions: tuple[tuple[str, str], ...],
         searched: Sequence[str],
         hint: str = "",
-    ):
+    ) -> None:
         self.name, self.where, self.suggestions, self.searched = name, where, suggestions, searched
         near = ", ".join(f"{glass} ({catalog})" for glass, catalog in suggestions)
         super().__init__(
@@ -104,15 +104,11 @@ def find_glass(
     """
     wanted = name.strip()
     of_user = [load(path) for path in user_catalogs(user)]
-    for catalog in of_user:
-        glass = catalog.find(wanted)
-        if glass:
-            return replace(glass, name=name)
-    for catalog in catalogs:
+    for catalog in (*of_user, *catalogs):
         glass = catalog.find(wanted) if isinstance(catalog, Catalog) else _of_shipped(wanted, catalog)
         if glass:
             return replace(glass, name=name)
-    others = [_shipped_glass(wanted, catalog) for catalog in SHIPPED if wanted.upper() in _shipped_names(catalog)]
+    others = [_shipped_glass(wanted, shipped) for shipped in SHIPPED if wanted.upper() in _shipped_names(shipped)]
     if others:
         _warn_if_ambiguous(others, where)
         return replace(others[0], name=name)
@@ -159,12 +155,13 @@ def nearest_glasses(
 
     def distance(other: Glass) -> float:
         if other.nd_listed is None or not other.abbe_listed:
-            return float("inf")
+            return math.inf
         return (other.nd_listed - index) ** 2 + (_PER_ABBE * (other.abbe_listed - dispersion)) ** 2
 
     def is_same(other: Glass) -> bool:
-        name = glass.listed_name or glass.name if isinstance(glass, Glass) else ""
-        return name == other.name and same_catalog(glass.catalog, other.catalog)
+        if not isinstance(glass, Glass) or (glass.listed_name or glass.name) != other.name:
+            return False
+        return same_catalog(glass.catalog, other.catalog)
 
     others = (other for catalog in sought for other in catalog.glasses.values() if not is_same(other))
     return tuple(sorted(others, key=distance)[:count])
@@ -177,10 +174,10 @@ def _named_catalog(name: str, of_user: Sequence[Catalog]) -> Catalog:
 def _nd_and_vd(glass: Glass) -> tuple[float, float]:
     if glass.nd_listed is not None and glass.abbe_listed:
         return glass.nd_listed, glass.abbe_listed
-    found = float(nd(glass)), float(abbe_number(glass))
-    if not math.isfinite(found[0]) or not found[1]:
+    index, dispersion = float(nd(glass)), float(abbe_number(glass))
+    if not math.isfinite(index) or not dispersion:
         raise ValueError(f"{glass.name or 'this medium'} has no nd and Vd; give a pair (nd, Vd)")
-    return found
+    return index, dispersion
 
 
 def edition(glass: Glass) -> tuple[str, ...]:
@@ -206,17 +203,13 @@ def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()
     return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in of_user)
 
 
-def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:
-    """Up to `count` (glass, catalog) of similar names, the nearest first; hyphens are ignored."""
-    return _nearest(name, [load(path) for path in user_catalogs(user)], count)
-
-
-def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[str, str], ...]:
+def _nearest(name: str, supplied: Sequence[Catalog]) -> tuple[tuple[str, str], ...]:
+    """Up to five (glass, catalog) of similar names, the nearest first; hyphens are ignored."""
     spellings: dict[str, list[tuple[str, str]]] = {}
-    for glass, catalog in _listed_names(own):
+    for glass, catalog in _listed_names(supplied):
         spellings.setdefault(_bare(glass), []).append((glass, catalog))
-    near = difflib.get_close_matches(_bare(name), spellings, n=count, cutoff=0.6)
-    return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
+    near = difflib.get_close_matches(_bare(name), spellings, n=5, cutoff=0.6)
+    return tuple(hit for spelling in near for hit in spellings[spelling])[:5]
 
 
 def plain_names(
@@ -236,9 +229,9 @@ def _listed_names(first: Sequence[Catalog]) -> Iterator[tuple[str, str]]:
     yield from ((glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values())
 
 
-def same_catalog(one: str, other: str) -> bool:
+def same_catalog(a: str, b: str) -> bool:
     """Whether two names denote the same catalog, as NIKON and HIKARI do."""
-    return one.upper() == other.upper() or (_shipped_name(one) or one) == (_shipped_name(other) or other)
+    return a.upper() == b.upper() or (_shipped_name(a) or a) == (_shipped_name(b) or b)
 
 
 def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
@@ -344,11 +337,11 @@ def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
         warnings.warn(message, AmbiguousGlass, stacklevel=calling_level())
 
 
-def _difference(one: Glass, other: Glass) -> float:
+def _difference(a: Glass, b: Glass) -> float:
     """Largest difference of two indices in the range they share, or at the d line if they share none."""
-    spans = [glass.wavelength_range for glass in (one, other) if glass.wavelength_range]
+    spans = [glass.wavelength_range for glass in (a, b) if glass.wavelength_range]
     shortest, longest = max((span[0] for span in spans), default=1.0), min((span[1] for span in spans), default=0.0)
     if shortest > longest:
         shortest = longest = LINES["d"]
     wavelengths = torch.linspace(shortest, longest, 9, dtype=torch.float64)
-    return float((refractive_index(one, wavelengths) - refractive_index(other, wavelengths)).abs().max())
+    return float((refractive_index(a, wavelengths) - refractive_index(b, wavelengths)).abs().max())

@@ -26,10 +26,10 @@ from raytrace.words import RaytraceWarning, option
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)
 
-#: °C above which the formula of air has a density: its pole is at -272.5; and up to which a glass is one.
+#: °C: the formula of air has a pole at -272.5; above HOTTEST a glass is a melt.
 COLDEST, HOTTEST = -272.0, 1000.0
 
-#: °C between which thermal coefficients of catalogs are fitted (SCHOTT TIE-19).
+#: °C: the range to which thermal coefficients of catalogs are fitted (SCHOTT TIE-19).
 FITTED = -100.0, 140.0
 
 
@@ -103,18 +103,18 @@ def index_change(glass: Glass, wavelength: Tensor, temperature: Tensor, index: T
     return 0.5 * (index - 1.0 / index) * (warmer * (D0 + warmer * (D1 + warmer * D2)) + resonant)
 
 
-def index_in(glass: Glass, wavelength: Tensor, air: Environment, own: Environment | None = None) -> Tensor:
+def index_in(glass: Glass, wavelength: Tensor, air: Environment, local: Environment | None = None) -> Tensor:
     """n (...) of a medium relative to the air of a lens, for wavelengths (...) µm in that air; 0 where undefined.
 
-    own: the medium's environment if it is not that of the lens: another temperature of the glass, or of the air in a
+    local: the medium's environment if it is not that of the lens: another temperature of the glass, or of the air in a
     gap. Differentiable in temperature and pressure. Without checks, as `refractive_index`.
     """
     exact = wavelength.double()
-    place = _like(air if own is None else own, exact)
+    place = _like(air if local is None else local, exact)
     around = air_index(exact, *_like(air, exact))
     if is_model(glass):
         n = refractive_index(glass, exact)
-        return (n if own is None else n * (air_index(exact, *place) / around)).to(wavelength.dtype)
+        return (n if local is None else n * (air_index(exact, *place) / around)).to(wavelength.dtype)
     of_catalog = air_index(exact, thermal(glass).reference, REFERENCE[1])
     length = exact * around / of_catalog
     n = refractive_index(glass, length)

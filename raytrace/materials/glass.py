@@ -15,7 +15,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -152,12 +152,13 @@ def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     return nd + b * (1.0 / wavelength - 1 / _D) + c * (wavelength**-3.5 - _D**-3.5)
 
 
-class Formula(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Formula:
     """A dispersion formula.
 
     coefficients: their names. index: function of (coefficients (m, ...), wavelength (...) µm), float64, giving n.
     number: of the formula in an AGF file. wavelengths: µm, outside which it is not evaluated, so that powers down to
-    λ⁻¹² and their derivatives stay finite; None where the wavelength does not count.
+    λ⁻¹² and their derivatives stay finite; None for a constant index.
     """
 
     coefficients: str
@@ -167,7 +168,7 @@ class Formula(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many coefficients it takes."""
+        """The number of coefficients."""
         return len(self.coefficients.split())
 
 
@@ -198,7 +199,7 @@ FORMULAS = {
 BY_NUMBER = {formula.number: name for name, formula in FORMULAS.items() if formula.number}
 
 
-#: Behind the name of a formula: the same with errors of manufacture, by so many further coefficients.
+#: Behind the name of a formula: the formula with errors of manufacture, which are five further coefficients.
 WITH_ERRORS, _ERRORS = " with errors", 5
 
 
@@ -207,8 +208,8 @@ def formula_of(name: str) -> Formula:
     """The formula of a name that `Glass.formula` holds."""
     if name in FORMULAS:
         return FORMULAS[name]
-    own = FORMULAS[name.removesuffix(WITH_ERRORS)]
-    return Formula(f"{own.coefficients} Δn nd Vd ΔVd ΔPgF", partial(_with_errors, own))
+    nominal = FORMULAS[name.removesuffix(WITH_ERRORS)]
+    return Formula(f"{nominal.coefficients} Δn nd Vd ΔVd ΔPgF", partial(_with_errors, nominal))
 
 
 def _with_errors(formula: Formula, coefficients: Tensor, wavelength: Tensor) -> Tensor:
@@ -235,11 +236,11 @@ _UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and likely
 
 
 class ImplausibleWavelength(RaytraceError, ValueError):
-    """A wavelength that no lens is for: most likely it is in another unit than µm."""
+    """A wavelength outside the range of all lenses: most likely it is in another unit than µm."""
 
 
 class InvalidIndex(RaytraceError, ValueError):
-    """A glass has no real, positive refractive index at a wavelength asked of it."""
+    """A glass has no real, positive refractive index at a requested wavelength."""
 
 
 class OutOfRange(RaytraceWarning):
@@ -258,7 +259,7 @@ class Glass:
     wavelength_range: µm (shortest, longest) or None.
     status: "standard", "preferred", "obsolete", "special", "melt", or "" if not listed.
     nd_listed, abbe_listed: n_d and V_d as the catalog lists them (rounded by its maker), None if it does not.
-    alternatives: names of present-day glasses of the same catalog that come near, as the catalog comments say.
+    alternatives: names of similar present-day glasses of the same catalog, from its comments.
     listed_name: the catalog's own spelling of the name.
     comment: the catalog's comment on the glass.
     records: further figures of the catalog, (keyword, numbers) in file order: ED, TD, MD, OD, IT.
@@ -303,7 +304,8 @@ class Glass:
     @property
     def transmittance(self) -> tuple[tuple[float, float, float], ...]:
         """Rows (wavelength µm, internal transmittance, thickness mm) by wavelength; empty if not listed."""
-        return tuple(sorted(numbers[:3] for keyword, numbers in self.records if keyword == "IT" and len(numbers) > 2))
+        rows = (numbers for keyword, numbers in self.records if keyword == "IT" and len(numbers) > 2)
+        return tuple(sorted((wavelength, passed, depth) for wavelength, passed, depth, *_ in rows))
 
     def _figure(self, keyword: str, place: int) -> float | None:
         numbers = next((numbers for word, numbers in self.records if word == keyword), ())
@@ -341,7 +343,7 @@ def refractive_index(glass: Glass, wavelength: Tensor | float) -> Tensor:
 
 
 def internal_transmittance(glass: Glass, wavelength: Tensor | float, thickness: Tensor | float = 10.0) -> Tensor:
-    """The part of the light that a glass of some thickness (...) mm does not absorb, by the catalog; without surfaces.
+    """Internal transmittance of a glass of a thickness (...) mm by its catalog, without reflection at the surfaces.
 
         τ = exp(-α t),  α linear between the listed wavelengths
 
@@ -352,13 +354,13 @@ def internal_transmittance(glass: Glass, wavelength: Tensor | float, thickness: 
     if len(rows) < 2:
         return torch.full_like(wavelength * thickness, torch.nan)
     columns = [*zip(*rows, strict=True)]
-    at, τ, depth = torch.tensor(columns, dtype=torch.float64, device=wavelength.device)
+    listed, τ, depth = torch.tensor(columns, dtype=torch.float64, device=wavelength.device)
     absorption, exact = -torch.log(τ.clamp(torch.finfo(τ.dtype).tiny, 1.0)) / depth, wavelength.to(torch.float64)
-    k = torch.searchsorted(at, exact.detach().contiguous()).clamp(1, len(rows) - 1)
-    share = safe_divide(exact - at[k - 1], at[k] - at[k - 1])
+    k = torch.searchsorted(listed, exact.detach().contiguous()).clamp(1, len(rows) - 1)
+    share = safe_divide(exact - listed[k - 1], listed[k] - listed[k - 1])
     α = absorption[k - 1] + share * (absorption[k] - absorption[k - 1])
-    listed = (exact >= at[0]) & (exact <= at[-1])
-    return torch.where(listed, torch.exp(-α * thickness), torch.nan).to(wavelength.dtype)
+    inside = (exact >= listed[0]) & (exact <= listed[-1])
+    return torch.where(inside, torch.exp(-α * thickness), torch.nan).to(wavelength.dtype)
 
 
 def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:
@@ -392,11 +394,11 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
 def check_unit(
     wavelengths: Tensor, media: Iterable[Glass] = (), *, believed: Tensor | None = None, where: str = ""
 ) -> None:
-    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
+    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass transmits.
 
-    media: glasses whose range, where it reaches further, is believed. believed: wavelengths (...) known to be in µm, as
-    those of a lens file: up to ten times longer or shorter ones are, too. Raises ImplausibleWavelength, with a guess;
-    it refuses what is not above 0 and finite in any case.
+    media: glasses whose ranges are accepted as well. believed: wavelengths (...) known to be in µm, as those of a lens
+    file, which are accepted with up to ten times longer and shorter ones. Raises ImplausibleWavelength, with a guess of
+    the unit, also for numbers that are not positive and finite.
     """
     spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
     known = [] if believed is None else [wave for wave in believed.detach().flatten().tolist() if 0 < wave < math.inf]
@@ -460,7 +462,9 @@ def constant(index: float | Tensor, name: str = "") -> Glass:
 _SELLMEIER = ("sellmeier_1", "sellmeier_3", "sellmeier_5")
 
 
-def sellmeier(strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known) -> Glass:
+def sellmeier(
+    strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known: Any
+) -> Glass:
     """The glass n² = 1 + Σ_i B_i λ²/(λ² - C_i): strengths B_i and poles C_i (µm²), (m, ...) with m ≤ 5.
 
     known: further fields of Glass, such as `wavelength_range`.
@@ -505,19 +509,19 @@ def with_index_errors(
     if not glass.formula.endswith(WITH_ERRORS):
         if abbe is not None and not has_abbe_number(glass):
             raise InvalidIndex(f"{label(glass) or 'the medium'} has no Abbe number: expected a glass with dispersion")
-        own = glass.coefficients.double()
+        nominal = glass.coefficients.double()
         numbers = torch.stack([refractive_index(glass, LINES[line]) for line in "dFC"])
         n, v = numbers[0], safe_divide(numbers[0] - 1.0, numbers[1] - numbers[2])
-        deviation = own[2] if glass.formula == "model" else torch.zeros_like(n)
-        parts = torch.broadcast_tensors(*own.unbind(0), 0 * n, n, v, 0 * n, deviation)
+        deviation = nominal[2] if glass.formula == "model" else torch.zeros_like(n)
+        parts = torch.broadcast_tensors(*nominal.unbind(0), 0 * n, n, v, 0 * n, deviation)
         name = f"{glass.formula}{WITH_ERRORS}"
         glass = dataclasses.replace(glass, formula=name, coefficients=torch.stack(parts), catalog="", status="")
-    *own, change, n, v, abbe_change, deviation = glass.coefficients.unbind(0)
+    *inner, change, n, v, abbe_change, deviation = glass.coefficients.unbind(0)
     if index is not None:
         change = change + index.double()
     if abbe is not None:
         abbe_change = abbe_change + (v * abbe.double() / 100 if percent else abbe.double())
-    parts = torch.broadcast_tensors(*own, change, n, v, abbe_change, deviation)
+    parts = torch.broadcast_tensors(*inner, change, n, v, abbe_change, deviation)
     return dataclasses.replace(glass, coefficients=torch.stack(parts))
 
 
@@ -528,7 +532,7 @@ def has_abbe_number(glass: Glass) -> bool:
 
 
 def label(glass: Glass) -> str:
-    """The name of a medium; of one without a name n_d/V_d of a model glass, "n 1.5" of a constant index, "" of air."""
+    """The name of a medium; without a name, n_d/V_d of a model glass, "n 1.5" of a constant index, "" of air."""
     if glass.name or glass.coefficients.dim() > 1:
         return glass.name
     numbers = glass.coefficients.tolist()
@@ -560,7 +564,7 @@ def mil_glass(code: str) -> Glass:
     return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
 
 
-#: Powers of λ in Schott's formula, the first m of which m measured indices decide, and the place of each in it.
+#: Powers of λ in Schott's formula in the order in which measured indices determine them, and their places in it.
 _SCHOTT_POWERS, _SCHOTT_PLACES = (0, -2, 2, -4, -6, -8), (0, 2, 1, 3, 4, 5)
 
 
@@ -574,9 +578,9 @@ def from_table(
 ) -> Glass:
     """The glass n² = a₀ + a₂ λ⁻² + a₁ λ² + a₃ λ⁻⁴ + … through indices (m,) at wavelengths (m,) µm.
 
-    As many indices as there are terms are met exactly, more by least squares; of these the first `exact` ones, fewer
-    than there are terms, still are. Differentiable in the indices.
-    Raises ValueError for lists of unequal length, for equal wavelengths and for numbers that are none.
+    As many indices as terms are met exactly. More are fitted by least squares, of which the first `exact`, fewer than
+    the terms, are met exactly. Differentiable in the indices. Raises ValueError for lists of unequal length, equal
+    wavelengths, and numbers that are not finite and positive.
     """
     w, n = (torch.as_tensor(part, dtype=torch.float64) for part in (wavelengths, indices))
     if w.dim() != 1 or w.shape != n.shape or not len(w):
@@ -584,7 +588,7 @@ def from_table(
     if not bool((w > 0).all() & torch.isfinite(w).all() & (n > 0).all() & torch.isfinite(n).all()):
         raise ValueError(f"wavelengths {w.tolist()} µm and indices {n.tolist()}: expected finite, positive numbers")
     if len(torch.unique(w)) < len(w):
-        raise ValueError(f"a wavelength stands twice in {w.tolist()}: expected one index for each")
+        raise ValueError(f"a wavelength occurs twice in {w.tolist()}: expected one index for each")
     terms, exact = min(len(w), terms, len(_SCHOTT_POWERS)), min(exact, len(w))
     a = _meeting(torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1), n * n, exact)
     coefficients = a.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), a)
@@ -595,7 +599,7 @@ def _meeting(basis: Tensor, values: Tensor, exact: int) -> Tensor:
     """a (k,) of basis (m, k) · a = values (m,) by least squares, the first `exact` rows, fewer than k, met exactly."""
     if not len(values) > basis.shape[1] > exact > 0:
         return torch.linalg.lstsq(basis, values[:, None]).solution[:, 0]
-    # a = Q (y, z): the first rows decide y, least squares z
+    # a = Q (y, z): y by the first rows, z by least squares
     values, (q, r) = values[:, None], torch.linalg.qr(basis[:exact].T, mode="complete")
     y = torch.linalg.solve_triangular(r[:exact].T, values[:exact], upper=False)
     rest = basis[exact:] @ q
@@ -608,29 +612,29 @@ def _meeting(basis: Tensor, values: Tensor, exact: int) -> Tensor:
 #: Powers of λ in the formula "extended_3", in the order of its coefficients.
 _EXTENDED_POWERS = (0, 2, 4, -2, -4, -6, -8, -10, -12)
 
-#: Largest difference of a melt's index from the index that it stands for, between the wavelengths of a lens.
+#: Largest difference of a melt's index from that of the glass with errors, between the wavelengths of a lens.
 MELT_ERROR = 1e-7
 _MARGIN = 0.1  # of the wavelengths of a lens, by which the fit of a melt reaches further
 
 
 class NoMelt(RaytraceError, ValueError):
-    """No formula of a catalog comes near the dispersion of a glass with index errors."""
+    """No formula of a catalog fits the dispersion of a glass with index errors."""
 
 
 def melt(glass: Glass, wavelengths: Tensor) -> Glass:
     """The medium of a glass with index errors by a formula that lens files hold.
 
     wavelengths: (W,) µm, those of a lens. A constant index, a model glass and Conrady's formula keep their formula and
-    are the same at all wavelengths. Others are n² = a₀ + a₁ λ² + a₂ λ⁴ + a₃ λ⁻² + … + a₈ λ⁻¹² ("extended_3", status
-    "melt"): the same at up to 9 wavelengths, between them by least squares. A glass without errors passes as it is.
+    are exact at all wavelengths. Others are n² = a₀ + a₁ λ² + a₂ λ⁴ + a₃ λ⁻² + … + a₈ λ⁻¹² ("extended_3", status
+    "melt"): exact at up to 9 wavelengths, between them by least squares. A glass without errors is returned itself.
     Raises NoMelt where the indices differ by more than MELT_ERROR between the wavelengths, or where there is none.
     """
     if not glass.formula.endswith(WITH_ERRORS):
         return glass
     formula = glass.formula.removesuffix(WITH_ERRORS)
-    own, errors = glass.coefficients[:-_ERRORS], glass.coefficients[-_ERRORS:]
+    nominal, errors = glass.coefficients[:-_ERRORS], glass.coefficients[-_ERRORS:]
     if formula == "constant":
-        return dataclasses.replace(glass, formula=formula, coefficients=own + errors[:1])
+        return dataclasses.replace(glass, formula=formula, coefficients=nominal + errors[:1])
     if formula in ("model", "conrady"):
         return dataclasses.replace(glass, formula=formula, coefficients=_of_three(glass, formula))
     w = torch.unique(wavelengths.detach().double().cpu())
@@ -639,10 +643,10 @@ def melt(glass: Glass, wavelengths: Tensor) -> Glass:
     between, error = torch.linspace(low, high, 201, dtype=torch.float64), math.inf
     for margin in (_MARGIN, 0.0):
         ends = min(low, max(low * (1 - margin), span[0])), max(high, min(high * (1 + margin), span[1]))
-        found = _extended(glass, w, ends)
-        error = float((refractive_index(found, between) - refractive_index(glass, between)).abs().max())
+        fitted = _extended(glass, w, ends)
+        error = float((refractive_index(fitted, between) - refractive_index(glass, between)).abs().max())
         if error <= MELT_ERROR and bool((refractive_index(glass, between) > 0).all()):
-            return found
+            return fitted
     name, reason = glass.name or "a glass", f"a formula differs by {error:.1e}, {MELT_ERROR:.0e} at most is accepted"
     raise NoMelt(f"{name} with index errors has no melt from {low:g} to {high:g} µm: {reason}")
 
@@ -660,45 +664,39 @@ def _of_three(glass: Glass, formula: str) -> Tensor:
 
 def _extended(glass: Glass, w: Tensor, ends: tuple[float, float]) -> Glass:
     """The formula "extended_3" for a glass between two wavelengths, µm, exact at w (W,) µm where its terms suffice."""
-    middle = (ends[0] * ends[1]) ** 0.5  # in units of which powers are alike in size
+    middle = (ends[0] * ends[1]) ** 0.5  # the unit of λ, in which all powers are of similar size
     nodes = 0.5 * (1 - torch.cos(torch.linspace(0, math.pi, 41, dtype=torch.float64)))
-    met = len(w) == len(_EXTENDED_POWERS)  # by as many terms, without a rest for least squares
+    met = len(w) == len(_EXTENDED_POWERS)  # by as many terms: no least squares
     points = w if met else torch.cat([w, ends[0] + (ends[1] - ends[0]) * nodes])
     n = refractive_index(glass, points)
     scaled = torch.stack([(points / middle) ** power for power in _EXTENDED_POWERS], -1)
     a = _meeting(scaled, n * n, len(w)) / middle ** torch.tensor(_EXTENDED_POWERS, dtype=torch.float64)
-    found = Glass(
+    fitted = Glass(
         glass.name, "extended_3", a, wavelength_range=ends, status="melt", listed_name=glass.listed_name,
         records=glass.records,
     )  # fmt: skip
-    figures = (float(nd(found)), float(abbe_number(found)))
+    figures = (float(nd(fitted)), float(abbe_number(fitted)))
     if figures[0] > 0 and 0 < figures[1] < math.inf:
-        found = dataclasses.replace(found, nd_listed=figures[0], abbe_listed=figures[1])
-    return found
+        fitted = dataclasses.replace(fitted, nd_listed=figures[0], abbe_listed=figures[1])
+    return fitted
 
 
 def normal_line_deviation(glass: Glass) -> Tensor:
     """ΔP_gF = (n_g - n_F)/(n_F - n_C) - 0.6438 + 0.001682 V_d, the number a model glass takes; 0 without dispersion."""
-    return _off_normal_line(*_at_lines(glass, "gFC"), abbe_number(glass))
+    violet, blue, red = _at_lines(glass, "gFC")
+    return _off_normal_line(violet, blue, red, abbe_number(glass))
 
 
 def _off_normal_line(violet: Tensor, blue: Tensor, red: Tensor, abbe: Tensor) -> Tensor:
     return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - (0.6438 - 0.001682 * abbe))
 
 
-def listing_error(glass: Glass) -> tuple[float, float]:
-    """How far n_d and V_d by the coefficients lie from the listed ones; (nan, nan) where the catalog lists none."""
-    if glass.nd_listed is None or glass.abbe_listed is None:
-        return math.nan, math.nan
-    return float(nd(glass)) - glass.nd_listed, float(abbe_number(glass)) - glass.abbe_listed
-
-
-#: How far from 1 the index of a gas may be: air at 1 atm has 1.0003, carbon dioxide 1.0005.
+#: Largest n - 1 of a gas: air at 1 atm has 0.0003, carbon dioxide 0.0005.
 _GAS = 1e-3
 
 
 def is_air(glass: Glass) -> bool:
-    """Whether a medium is air, or as thin as it: its index at the d line is 1 to 1e-3, whatever its name."""
+    """Whether a medium is air or another gas: its index at the d line is 1 to 1e-3, whatever its name."""
     return glass.formula != "mirror" and bool(((nd(glass).detach() - 1).abs() < _GAS).all())
 
 

@@ -39,7 +39,7 @@ from raytrace.words import calling_level
 class GlassFigures(Result):
     """A glass and its indices (W,) at wavelengths (W,) µm.
 
-    environment: that whose air the indices and wavelengths refer to, None for the catalog's reference air; dn_dt,
+    environment: the air that the indices and wavelengths refer to, None for the catalog's reference air; dn_dt,
     dn_dt_absolute: (W,) 1/K, relative to air at the glass's temperature and relative to vacuum. transmittance: (W,)
     internal, of 10 mm, nan where not listed. Expansion, density and price are those of `glass`.
     """
@@ -59,12 +59,17 @@ class GlassFigures(Result):
     dn_dt_absolute: Tensor | None = None
 
     def columns(self) -> dict[str, Tensor]:
-        changes = {"dn_dt": self.dn_dt, "dn_dt_absolute": self.dn_dt_absolute} if self.environment else {}
         listed = {"transmittance": self.transmittance} if self.glass.transmittance else {}
-        return {"wavelength": self.wavelengths, "index": self.indices, **changes, **listed}
+        return {"wavelength": self.wavelengths, "index": self.indices, **self._changes(), **listed}
+
+    def _changes(self) -> dict[str, Tensor]:
+        """dn/dT where the environment is specified."""
+        if self.dn_dt is None or self.dn_dt_absolute is None:
+            return {}
+        return {"dn_dt": self.dn_dt, "dn_dt_absolute": self.dn_dt_absolute}
 
     def document(self) -> dict:
-        glass = self.glass
+        glass, air = self.glass, self.environment
         return {
             "name": glass.name,
             "catalog": glass.catalog or None,
@@ -78,16 +83,9 @@ class GlassFigures(Result):
             "wavelengths": self.wavelengths.tolist(),
             "transmittance": numbers(self.transmittance),
             "indices": self.indices.tolist(),
-        } | (
-            {}
-            if self.environment is None
-            else {
-                "temperature": number(self.environment.temperature),
-                "pressure": number(self.environment.pressure),
-                "dn_dt": self.dn_dt.tolist(),
-                "dn_dt_absolute": self.dn_dt_absolute.tolist(),
-            }
-        )
+            **({} if air is None else {"temperature": number(air.temperature), "pressure": number(air.pressure)}),
+            **{name: numbers(change) for name, change in self._changes().items()},
+        }
 
     def tables(self) -> list[Table]:
         glass, span = self.glass, self.glass.wavelength_range
@@ -114,7 +112,7 @@ class GlassFigures(Result):
         return [Table(self.columns(), [*lines, ""])]
 
 
-#: Fields of a glass beside its dispersion.
+#: Fields of a glass other than its dispersion.
 _FIGURES = "expansion", "expansion_20_300", "density", "relative_price"
 
 

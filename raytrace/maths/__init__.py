@@ -5,7 +5,7 @@
 | numerics  | functions that stay finite with their gradients; dual numbers; values, dataclasses of tensors  |
 | tangents  | tensors that carry their derivatives by n variables: vector forward mode in one pass            |
 | sampling  | points and weights on the unit disc (Gauss, hexapolar, Sobol …): table SAMPLINGS; pixel grids   |
-| zernike   | Zernike polynomials: Noll, ANSI and fringe indices, values, gradients, fits                    |
+| zernike   | Zernike polynomials: Noll's and fringe indices, values, gradients, fits                    |
 | bivariate | polynomials in x and y with derivatives                                                        |
 | arrays    | .npy and .npz files, read with care                                                            |
 | result    | results of public functions: columns, text, document, frame                                    |

@@ -1,4 +1,4 @@
-"""Arrays in files, read with care: .npy and .npz, sizes checked before memory is taken, never an object unpickled."""
+"""Arrays of .npy and .npz files: sizes are checked before memory is taken, and no object is unpickled."""
 
 import io
 import math
@@ -21,11 +21,12 @@ class ArrayError(RaytraceError, ValueError):
 
 
 def read_npy(content: bytes) -> list[np.ndarray]:
-    """The arrays that stand one after another in the bytes of an .npy file. Raises ArrayError."""
-    stream, found = io.BytesIO(content), []
-    while not found or stream.tell() < len(content):
-        found.append(_array(stream, len(content)))
-    return found
+    """The arrays of an .npy file, one behind another. Raises ArrayError."""
+    stream = io.BytesIO(content)
+    arrays = [_array(stream, len(content))]
+    while stream.tell() < len(content):
+        arrays.append(_array(stream, len(content)))
+    return arrays
 
 
 def read_npz(content: bytes) -> dict[str, np.ndarray]:
@@ -44,7 +45,7 @@ def read_npz(content: bytes) -> dict[str, np.ndarray]:
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """What an archive holds under a name: never more than it announces, whatever is packed into it."""
+    """The content of a member of an archive. Raises ArrayError where its size differs from that of its entry."""
     with archive.open(member) as stream:
         part = stream.read(member.file_size + 1)
     if len(part) != member.file_size:

@@ -1,4 +1,4 @@
-"""Polynomials in x and y: Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …, and Zernike's fringe terms as such."""
+"""Polynomials in x and y: Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …, and Zernike's terms in these."""
 
 import functools
 import math
@@ -35,7 +35,7 @@ def round_power(n: int) -> dict[tuple[int, int], int]:
 
 
 def degree(count: int) -> int:
-    """The least degree n whose n(n + 3)/2 terms are `count` or more."""
+    """The smallest degree n for which n(n + 3)/2, the number of terms, is at least `count`."""
     return math.ceil((math.sqrt(9 + 8 * count) - 3) / 2)
 
 
@@ -72,7 +72,8 @@ def shifted(coefficients: Sequence[Tensor], x: Tensor, y: Tensor) -> tuple[Tenso
 
     coefficients: (...) each, in the order of `powers`, as those of the result.
     """
-    order, sums = powers(len(coefficients)), {}
+    order = powers(len(coefficients))
+    sums: dict[tuple[int, int], Tensor] = {}
     for (i, j), c in zip(order, coefficients, strict=True):
         for p in range(i + 1):
             for q in range(j + 1):
@@ -107,15 +108,16 @@ def zernike_to_powers(orders: tuple[tuple[int, int], ...]) -> tuple[np.ndarray, 
 
 
 def _terms(n: int, m: int) -> dict[tuple[int, int], float]:
-    size, found = abs(m), {}
+    size = abs(m)
+    terms: dict[tuple[int, int], float] = {}
     for s in range((n - size) // 2 + 1):
         plus, minus = (n + size) // 2 - s, (n - size) // 2 - s
         c = (-1) ** s * math.factorial(n - s) // (math.factorial(s) * math.factorial(plus) * math.factorial(minus))
         for power, weight in _harmonic_terms(m).items():
             for k in range(minus + 1):  # (x² + y²)^minus
                 key = power[0] + 2 * k, power[1] + 2 * (minus - k)
-                found[key] = found.get(key, 0) + c * weight * math.comb(minus, k)
-    return found
+                terms[key] = terms.get(key, 0) + c * weight * math.comb(minus, k)
+    return terms
 
 
 def _harmonic_terms(m: int) -> dict[tuple[int, int], int]:

@@ -12,17 +12,17 @@ numpy's functions work on dual numbers as on arrays. Source: Clifford 1873; Grie
 
 Values: frozen dataclasses of tensors that `torch.func` and `torch.utils._pytree` can walk.
 
-What surrounds a computation: a graph, a forward derivative, a transform of torch.func. Names that are private to torch
-stand in this file alone. Nested transforms wrap a tensor once for each; the innermost one shows.
+State of torch: whether a graph, a forward derivative or a transform of torch.func is active. Names that are private to
+torch occur in this file alone. Nested transforms wrap a tensor once for each; the innermost one shows.
 """
 
 import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass as value
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, overload
 
 import numpy as np
 import torch
@@ -31,6 +31,18 @@ from torch._C._functorch import get_unwrapped
 from torch._C._functorch import is_functorch_wrapped_tensor as is_wrapped
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
+
+#: A number of any type: a tensor, an array, a dual number or a plain number.
+Number: TypeAlias = Any
+
+Value = TypeVar("Value")
+
+
+class Dataclass(Protocol):
+    """A value of any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
 
 #: A context in which torch's functions take tensors of a subclass as plain ones.
 plain_functions = torch._C.DisableTorchFunctionSubclass
@@ -46,12 +58,7 @@ def in_forward_mode() -> bool:
     return getattr(forward_ad, "_current_level", -1) >= 0
 
 
-def has_forward_derivative(number: Tensor) -> bool:
-    """Whether a tensor carries a forward derivative of torch."""
-    return in_forward_mode() and forward_ad.unpack_dual(number).tangent is not None
-
-
-def varies(number: Tensor | float | None) -> bool:
+def varies(number: object) -> bool:
     """Whether a derivative by this number may be requested: backward, forward, by tangents
     (`maths.tangents`), or by a transform of torch.func.
 
@@ -61,13 +68,13 @@ def varies(number: Tensor | float | None) -> bool:
         return False
     if number.requires_grad or hasattr(number, "tangents") or is_wrapped(number):
         return True
-    return has_forward_derivative(number)
+    return in_forward_mode() and forward_ad.unpack_dual(number).tangent is not None
 
 
 def differentiating() -> bool:
-    """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
+    """Whether derivatives may be requested: a graph is recorded, or a forward derivative (`jvp`) is under way.
 
-    False only under `torch.no_grad()` with no forward derivative; then what serves derivatives alone is left out.
+    False only under `torch.no_grad()` with no forward derivative; then operations for derivatives alone are left out.
     """
     return torch.is_grad_enabled() or in_forward_mode()
 
@@ -94,7 +101,11 @@ def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(nonzero, numerator / torch.where(nonzero, denominator, 1.0), 0.0)
 
 
-def dot(a, b):
+@overload
+def dot(a: Tensor | Sequence[Tensor], b: Tensor | Sequence[Tensor]) -> Tensor: ...
+@overload
+def dot(a: Iterable[Number], b: Iterable[Number]) -> Number: ...
+def dot(a: Iterable[Number], b: Iterable[Number]) -> Number:
     """Scalar product over the leading axis of length 3, of tensors or of three dual numbers each.
 
     Written out, not summed over an axis: a reduction may associate differently in batches of different shape, and
@@ -105,7 +116,7 @@ def dot(a, b):
     return torch.addcmul(ax * bx + ay * by, az, bz) if isinstance(az, Tensor) else ax * bx + ay * by + az * bz
 
 
-def dot_2(a: Tensor, b: Tensor) -> Tensor:
+def dot_2(a: Number, b: Number) -> Number:
     """Scalar product over a leading axis of length 2."""
     return a[0] * b[0] + a[1] * b[1]
 
@@ -144,7 +155,7 @@ def placed(entries: Tensor, mask: Tensor) -> Tensor:
 def unit(vector: Tensor) -> Tensor:
     """vector/|vector| over the leading axis of length 3; scaled first, so that 1e-200 and 1e200 keep their direction.
 
-    A zero or non-finite vector comes back as NaN-free zeros, which callers flag by `norm == 0`.
+    A zero or non-finite vector gives zeros, without nan.
     """
     largest = vector.detach().abs().amax(0)
     usable = (largest > 0) & (largest < torch.inf)
@@ -153,7 +164,11 @@ def unit(vector: Tensor) -> Tensor:
     return scaled / norm
 
 
-def polynomial(coefficients, x):
+@overload
+def polynomial(coefficients: Tensor, x: Tensor) -> Tensor: ...
+@overload
+def polynomial(coefficients: Sequence[Number], x: Number) -> Number: ...
+def polynomial(coefficients: Sequence[Number] | Tensor, x: Number) -> Number:
     """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`, or m dual numbers."""
     if not isinstance(coefficients, Tensor):
         return functools.reduce(lambda total, coefficient: total * x + coefficient, reversed(coefficients), 0.0)
@@ -175,7 +190,7 @@ class Dual:
     __slots__ = ("slope", "value")
     __array_priority__ = 1000
 
-    def __init__(self, value, slope: np.ndarray):
+    def __init__(self, value: Number, slope: np.ndarray) -> None:
         self.value, self.slope = value, slope
 
     @property
@@ -189,95 +204,95 @@ class Dual:
         """The derivatives (n, ...) in full, with every axis of the value."""
         return np.broadcast_to(_under(self.slope, np.ndim(self.value)), (len(self.slope), *np.shape(self.value)))
 
-    def __add__(self, other):
+    def __add__(self, other: Number) -> "Dual":
         if isinstance(other, Dual):
             return Dual(self.value + other.value, _sum(self, other))
         return Dual(self.value + other, self.slope if np.ndim(other) == 0 else _under(self.slope, _dim(self, other)))
 
-    def __sub__(self, other):
+    def __sub__(self, other: Number) -> "Dual":
         if isinstance(other, Dual):
             return Dual(self.value - other.value, _sum(self, -other))
         return Dual(self.value - other, self.slope if np.ndim(other) == 0 else _under(self.slope, _dim(self, other)))
 
-    def __rsub__(self, other):
+    def __rsub__(self, other: Number) -> "Dual":
         return -self + other
 
-    def __neg__(self):
+    def __neg__(self) -> "Dual":
         return Dual(-self.value, -self.slope)
 
-    def __mul__(self, other):
+    def __mul__(self, other: Number) -> "Dual":
         if isinstance(other, Dual):
             dim = _dim(self, other)
             slope = _under(self.slope, dim) * other.value + _under(other.slope, dim) * self.value
             return Dual(self.value * other.value, slope)
         return Dual(self.value * other, _under(self.slope, _dim(self, other)) * other)
 
-    def __truediv__(self, other):
+    def __truediv__(self, other: Number) -> "Dual":
         if isinstance(other, Dual):
             dim, ratio = _dim(self, other), self.value / other.value
             return Dual(ratio, (_under(self.slope, dim) - _under(other.slope, dim) * ratio) / other.value)
         return Dual(self.value / other, _under(self.slope, _dim(self, other)) / other)
 
-    def __rtruediv__(self, other):
+    def __rtruediv__(self, other: Number) -> "Dual":
         ratio = other / self.value
         return Dual(ratio, _under(self.slope, _dim(self, other)) * (-ratio / self.value))
 
-    def __pow__(self, power: float):
+    def __pow__(self, power: float) -> "Dual":
         return self._through(self.value**power, power * self.value ** (power - 1))
 
-    def __abs__(self):
+    def __abs__(self) -> "Dual":
         return self._through(np.abs(self.value), np.sign(self.value))
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def __getitem__(self, place):
+    def __getitem__(self, place: Any) -> "Dual":
         """Entries of the value by places of its axes; all its derivatives."""
         place = place if isinstance(place, tuple) else (place,)
         return Dual(self.value[place], self.full()[(slice(None), *place)])
 
-    def sum(self, axis: int | tuple[int, ...] | None = None):
+    def sum(self, axis: int | tuple[int, ...] | None = None) -> "Dual":
         axes = range(np.ndim(self.value)) if axis is None else (axis,) if isinstance(axis, int) else axis
         behind = tuple(a + 1 if a >= 0 else a for a in axes)
         return Dual(self.value.sum(tuple(axes)), self.full().sum(behind))
 
-    def reshape(self, *shape: int):
+    def reshape(self, *shape: int) -> "Dual":
         return Dual(self.value.reshape(shape), self.full().reshape(len(self.slope), *shape))
 
-    def _through(self, value, derivative):
+    def _through(self, value: Number, derivative: Number) -> "Dual":
         return Dual(value, _under(self.slope, np.ndim(value)) * derivative)
 
-    def __array_ufunc__(self, ufunc, method, *inputs, **options):
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Number, **options: object) -> Number:
         if method != "__call__" or options or ufunc not in _UFUNCS:
             return NotImplemented
         return _UFUNCS[ufunc](*inputs)
 
-    def __array_function__(self, function, types, arguments, options):
+    def __array_function__(self, function: Callable, types: object, arguments: tuple, options: dict) -> Number:
         if function not in _FUNCTIONS:
             return NotImplemented
         return _FUNCTIONS[function](*arguments, **options)
 
 
-def value_of(number):
-    """The value of a number that may be a dual one."""
+def value_of(number: Number) -> Number:
+    """The value of a number, dual or not."""
     return number.value if isinstance(number, Dual) else number
 
 
-def slope_of(number, variables: int) -> np.ndarray:
-    """The derivatives (n, ...) of a number by n variables; 0 where it is no dual one."""
+def slope_of(number: Number, variables: int) -> np.ndarray:
+    """The derivatives (n, ...) of a number by n variables; 0 of a number that is not dual."""
     return number.full() if isinstance(number, Dual) else np.zeros((variables, *np.shape(number)))
 
 
-def quotient(a, b):
+def quotient(a: Number, b: Number) -> Number:
     """a/b of tensors or numbers; infinite where a number b is 0."""
     return a / b if isinstance(b, Tensor) or value_of(b) != 0 else np.inf
 
 
-def divide(a, b):
+def divide(a: Number, b: Number) -> Number:
     """a/b of tensors, 0 where b is 0; of arrays or dual numbers as numpy divides."""
     return safe_divide(a, b) if isinstance(b, Tensor) else a / b
 
 
-def select(condition, a, b):
+def select(condition: Tensor | bool, a: Number, b: Number) -> Number:
     """a where a condition holds, else b: entry by entry of tensors, else one or the other number."""
     if not isinstance(condition, Tensor):
         return a if condition else b
@@ -285,7 +300,7 @@ def select(condition, a, b):
     return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64))
 
 
-def root(x):
+def root(x: Number) -> Number:
     """√x, 0 where x is negative, of a tensor, an array or dual numbers."""
     return safe_sqrt(x) if isinstance(x, Tensor) else np.sqrt(np.maximum(x, 0.0))
 
@@ -296,42 +311,42 @@ class Vector(tuple):
     __slots__ = ()
     __array_ufunc__ = None
 
-    def __sub__(self, other):
+    def __sub__(self, other: Iterable[Number]) -> "Vector":
         return Vector(a - b for a, b in zip(self, other, strict=True))
 
-    def __mul__(self, factor):
+    def __mul__(self, factor: Number) -> "Vector":
         return Vector(part * factor for part in self)
 
 
-def _dim(one: Dual, other) -> int:
-    """How many axes the two have together."""
-    other = other.slope.ndim - 1 if isinstance(other, Dual) else other.ndim if isinstance(other, np.ndarray) else 0
-    return max(one.slope.ndim - 1, other)
+def _dim(a: Dual, b: Number) -> int:
+    """The number of axes of the sum of a and b."""
+    dim = b.slope.ndim - 1 if isinstance(b, Dual) else b.ndim if isinstance(b, np.ndarray) else 0
+    return max(a.slope.ndim - 1, dim)
 
 
 def _under(slope: np.ndarray, dim: int) -> np.ndarray:
-    """Derivatives with so many axes behind that of the variables."""
+    """Derivatives (n, ...) with `dim` axes behind that of the variables."""
     missing = dim + 1 - slope.ndim
     return slope.reshape(len(slope), *(1,) * missing, *slope.shape[1:]) if missing > 0 else slope
 
 
-def _sum(one: Dual, other: Dual) -> np.ndarray:
-    if one.slope.ndim == other.slope.ndim:
-        return one.slope + other.slope
-    dim = _dim(one, other)
-    return _under(one.slope, dim) + _under(other.slope, dim)
+def _sum(a: Dual, b: Dual) -> np.ndarray:
+    if a.slope.ndim == b.slope.ndim:
+        return a.slope + b.slope
+    dim = _dim(a, b)
+    return _under(a.slope, dim) + _under(b.slope, dim)
 
 
-def _where(condition, one, other):
-    if not (isinstance(one, Dual) or isinstance(other, Dual)):
-        return np.where(condition, one, other)
-    value = np.where(condition, value_of(one), value_of(other))
-    count = len((one if isinstance(one, Dual) else other).slope)
-    parts = [_under(slope_of(x, count), np.ndim(value)) for x in (one, other)]
-    return Dual(value, np.where(condition, *parts))
+def _where(condition: np.ndarray, a: Number, b: Number) -> Number:
+    if not (isinstance(a, Dual) or isinstance(b, Dual)):
+        return np.where(condition, a, b)
+    value = np.where(condition, value_of(a), value_of(b))
+    count = len((a if isinstance(a, Dual) else b).slope)
+    slope_a, slope_b = (_under(slope_of(x, count), np.ndim(value)) for x in (a, b))
+    return Dual(value, np.where(condition, slope_a, slope_b))
 
 
-def _stack(numbers, axis: int = 0):
+def _stack(numbers: Sequence[Number], axis: int = 0) -> Dual:
     count = next(len(x.slope) for x in numbers if isinstance(x, Dual))
     values = np.broadcast_arrays(*[value_of(x) for x in numbers])
     shape = values[0].shape
@@ -339,22 +354,22 @@ def _stack(numbers, axis: int = 0):
     return Dual(np.stack(values, axis), np.stack(slopes, axis + 1 if axis >= 0 else axis))
 
 
-def _concatenate(numbers, axis: int = 0):
+def _concatenate(numbers: Sequence[Number], axis: int = 0) -> Dual:
     count = next(len(x.slope) for x in numbers if isinstance(x, Dual))
     values, slopes = [value_of(x) for x in numbers], [slope_of(x, count) for x in numbers]
     return Dual(np.concatenate(values, axis), np.concatenate(slopes, axis + 1 if axis >= 0 else axis))
 
 
-def _larger(one, other):
-    return _where(value_of(one) >= value_of(other), one, other)
+def _larger(a: Number, b: Number) -> Number:
+    return _where(value_of(a) >= value_of(b), a, b)
 
 
-def _smaller(one, other):
-    return _where(value_of(one) <= value_of(other), one, other)
+def _smaller(a: Number, b: Number) -> Number:
+    return _where(value_of(a) <= value_of(b), a, b)
 
 
 def _root(x: Dual) -> Dual:
-    """√x, whose derivative is 0 where x is 0: of a length of nothing, from which every way is up."""
+    """√x, with the derivative 0 where x is 0: there the derivative of a length has no direction."""
     root = np.sqrt(x.value)
     return x._through(
         root,
@@ -372,7 +387,7 @@ def _matrix_times(matrix: np.ndarray, vector: Dual) -> Dual:
     return Dual(matrix @ vector.value, vector.full() @ matrix.T)
 
 
-_UFUNCS = {
+_UFUNCS: dict[np.ufunc, Callable] = {
     np.matmul: _matrix_times,
     np.add: lambda a, b: b.__radd__(a) if isinstance(b, Dual) and not isinstance(a, Dual) else a + b,
     np.subtract: lambda a, b: b.__rsub__(a) if not isinstance(a, Dual) else a - b,
@@ -396,15 +411,13 @@ _UFUNCS = {
     np.rad2deg: _of(np.rad2deg, lambda x: 180 / np.pi),
 }
 
-_FUNCTIONS = {np.where: _where, np.stack: _stack, np.concatenate: _concatenate}
+_FUNCTIONS: dict[Callable, Callable] = {np.where: _where, np.stack: _stack, np.concatenate: _concatenate}
 
 
 _VALUE_TYPES: set[type] = set()
 
-Value = typing.TypeVar("Value")
 
-
-def summary(instance) -> str:
+def summary(instance: Dataclass) -> str:
     """A value with its fields that are not None."""
     fields = ((field.name, getattr(instance, field.name)) for field in dataclasses.fields(instance))
     entries = (f"{name}={_summary(item)}" for name, item in fields if item is not None)
@@ -412,7 +425,7 @@ def summary(instance) -> str:
 
 
 def _summary(item: object) -> str:
-    """A tensor of at most nine numbers as these, a larger one as shape, type and range; other items as they are."""
+    """The numbers of a tensor of at most nine, shape, type and range of a larger one; the repr of other items."""
     if type(item) is tuple:
         return f"({', '.join(map(_summary, item))}{',' if len(item) == 1 else ''})"
     if not isinstance(item, Tensor) or item.is_meta or is_wrapped(item):
@@ -479,7 +492,7 @@ def holds_numbers(annotation: object) -> bool:
 def _may_hold_tensors(annotation: object) -> bool:
     """Whether a field of this type is a tuple of numbers, each of which may be a tensor."""
     members = typing.get_args(annotation) if typing.get_origin(annotation) is tuple else ()
-    return any(isinstance(one, types.UnionType) and torch.Tensor in typing.get_args(one) for one in members)
+    return any(isinstance(member, types.UnionType) and Tensor in typing.get_args(member) for member in members)
 
 
 def check_precision(dtype: torch.dtype) -> None:
@@ -498,7 +511,7 @@ def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.devic
         check_precision(dtype)
     converted: dict[int, torch.Tensor] = {}
 
-    def convert(leaf):
+    def convert(leaf: object) -> object:
         if not isinstance(leaf, torch.Tensor):
             return leaf
         if id(leaf) not in converted:
@@ -508,14 +521,16 @@ def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.devic
     return pytree.tree_map(convert, instance)
 
 
-def detached(instance):
-    """The same value as plain numbers, without gradients: to be shown or drawn. Tensors that were one stay one, and a
-    value of plain numbers is itself."""
+def detached(instance: Value) -> Value:
+    """The same value without gradients, to be shown or drawn.
+
+    A tensor that occurs in several places stays one tensor; a value without gradients is returned itself.
+    """
     if not any(map(varies, pytree.tree_leaves(instance))):
         return instance
     seen: dict[int, torch.Tensor] = {}
 
-    def plain(leaf):
+    def plain(leaf: object) -> object:
         return seen.setdefault(id(leaf), leaf.detach()) if isinstance(leaf, torch.Tensor) else leaf
 
     return pytree.tree_map(plain, instance)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -17,6 +17,10 @@ from raytrace.files import write_atomically
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.plotting import style
 from raytrace.words import option
+
+if TYPE_CHECKING:  # both are slow to load
+    import pandas
+    from matplotlib.figure import Figure
 
 
 class Column(NamedTuple):
@@ -32,11 +36,14 @@ class Column(NamedTuple):
     heading: str = ""
 
 
-class Table(NamedTuple):
-    """A table of a text. columns: numbers or texts, by the name of the column or by a `Column` of the text alone;
-    title, notes: lines above and below."""
+#: Columns of a text: numbers or texts, by the name of the column or by a `Column` of the text alone.
+Columns: TypeAlias = Mapping[Any, Tensor | Sequence]
 
-    columns: Mapping[str | Column, Tensor | Sequence]
+
+class Table(NamedTuple):
+    """A table of a text, with lines above and below."""
+
+    columns: Columns
     title: Sequence[str] = ()
     notes: Sequence[str] = ()
 
@@ -69,6 +76,8 @@ class Result:
 
     __slots__ = ()
 
+    lens: Any  #: of results with columns of fields
+
     #: Columns that are not in the table COLUMNS, or have another unit or format.
     COLUMNS: ClassVar[Sequence[Column]] = ()
 
@@ -82,7 +91,7 @@ class Result:
         raise TypeError(f"{type(self).__name__} is no table; see its document() for what it holds")
 
     def words(self) -> dict[str, Sequence[str]]:
-        """Texts of a column whose numbers, 0 and up, count them, by the name of the column."""
+        """Texts of columns whose numbers are places in these texts, from 0, by the name of the column."""
         return {}
 
     def column(self, name: str) -> Column:
@@ -102,7 +111,7 @@ class Result:
         """Units of columns by their names, of those that have one; `to_frame` has them in `attrs`."""
         return {name: unit for name in self.columns() if (unit := self.column(name).unit)}
 
-    def to_frame(self):
+    def to_frame(self) -> "pandas.DataFrame":
         """The table for pandas, a row for every point of every curve; units are in `frame.attrs["units"]`."""
         import pandas
 
@@ -128,11 +137,11 @@ class Result:
         """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}
 
-    def draw(self, **options):
+    def draw(self, **options: Any) -> "Figure":
         """The figure of `plot`. Raises TypeError: no figure."""
         raise TypeError(f"{type(self).__name__} has no figure")
 
-    def plot(self, path: str | PathLike | None = None, *, dpi: float = 200, **options):
+    def plot(self, path: str | PathLike | None = None, *, dpi: float = 200, **options: Any) -> "Figure":
         """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given; dpi: pixels per inch
         of a .png.
 
@@ -159,20 +168,20 @@ class Result:
         parts = ((_block(t.title), html_table(self._printed(t.columns)), _block(t.notes)) for t in tables)
         return "\n".join(part for table in parts for part in table if part)
 
-    def _lines(self, columns: Mapping[str | Column, Tensor | Sequence]) -> list[str]:
+    def _lines(self, columns: Columns) -> list[str]:
         return text_table(self._printed(columns))
 
-    def _printed(self, columns: Mapping[str | Column, Tensor | Sequence]) -> dict[Column, Sequence]:
-        """Columns as they are printed: of fields with x = 0 without field_x."""
-        listed, words = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}, self.words()
+    def _printed(self, columns: Columns) -> dict[Column, Sequence]:
+        """Columns as they are printed, without field_x where it is 0."""
+        listed: dict[Any, Any] = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}
+        words, printed = self.words(), {}
         if "field_x" in listed and not np.any(listed["field_x"]):
             del listed["field_x"]
-        found = {}
         for name, values in listed.items():
-            known = name in words and name in columns and isinstance(columns[name], Tensor)
+            counted = name in words and isinstance(columns[name], Tensor)
             column = self.column(name) if isinstance(name, str) else name
-            found[column] = [words[name][int(value)] for value in values] if known else values
-        return found
+            printed[column] = [words[name][int(value)] for value in values] if counted else values
+        return printed
 
 
 def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
@@ -182,7 +191,7 @@ def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def axis(values: Tensor, place: int, axes: int) -> Tensor:
-    """A vector (n,) as axis number `place` of so many `axes`: a column of a table."""
+    """A vector (n,) as axis `place` of a tensor of `axes` axes: a column of a table."""
     return values.reshape(*(-1 if i == place else 1 for i in range(axes)))
 
 
@@ -197,7 +206,7 @@ def rows(columns: dict[str, Tensor]) -> list[dict]:
     return [dict(zip(table, map(number, row), strict=True)) for row in zip(*table.values(), strict=True)]
 
 
-def number(value) -> float | None:
+def number(value: Any) -> float | None:
     """A number for JSON; null for undefined, infinite and missing ones."""
     if value is None:
         return None
@@ -210,7 +219,7 @@ def numbers(values: Tensor) -> list:
     return [number(entry) if entry.dim() == 0 else numbers(entry) for entry in values.detach()]
 
 
-def plain(document):
+def plain(document: Any) -> Any:
     """A document for JSON: null for numbers that are not finite."""
     if isinstance(document, dict):
         return {name: plain(entry) for name, entry in document.items()}
@@ -225,11 +234,11 @@ def point_text(x: float, y: float) -> str:
 
 
 def cell(value: float, form: str) -> str:
-    """A number in a table of text, or - where there is none."""
+    """A number in a table of text; - for nan."""
     if not math.isfinite(value):
         return "-" if math.isnan(value) else str(float(value))
     shown = f"{value:{form.removeprefix('<')}}"
-    return shown if float(shown) else f"{0.0:{form.removeprefix('<')}}"  # what rounds to 0 has no sign
+    return shown if float(shown) else f"{0.0:{form.removeprefix('<')}}"  # a number that rounds to 0 has no sign
 
 
 def _cells(column: Column, values: Sequence) -> list[str]:
@@ -251,7 +260,7 @@ def text_table(columns: Mapping[Column, Sequence]) -> list[str]:
 
 
 def html_table(columns: Mapping[Column, Sequence]) -> str:
-    """The same as HTML, at most MOST_ROWS rows of it; empty without columns."""
+    """The table as HTML, at most MOST_ROWS rows of it; empty without columns."""
     if not columns:
         return ""
     sides = ["left" if column.form.startswith("<") else "right" for column in columns]
@@ -271,7 +280,7 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def object_text(distance: float) -> str:
-    """An object distance in mm, as it was given: `25 m`, `400 mm`, `infinity`."""
+    """An object distance of mm as a text: `25 m`, `400 mm`, `infinity`."""
     if math.isinf(distance):
         return "infinity"
     return (f"{distance / 1000:.6g} m" if abs(distance) >= 1e4 else f"{distance:.6g} mm").replace("-", "−")

@@ -6,6 +6,7 @@ Every rule of the disc returns points (2, P) and weights (P,) that sum to 1 and 
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from raytrace.maths.numerics import value
 from raytrace.words import option
 
 _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
-_POINT_BYTES = 64  # of a point and its weight, with what it takes to make them
+_POINT_BYTES = 64  # of a point and its weight, with the memory to compute them
 
 
 def _at_least_one(rule: str, **sizes: float) -> None:
@@ -26,9 +27,9 @@ def _at_least_one(rule: str, **sizes: float) -> None:
             raise ValueError(f"{rule}: {option(name)} is {size}; expected 1 or more")
 
 
-def _afford(count: float, what: str, size: str) -> None:
-    """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
-    afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps=f"ask for fewer {{{size}}}")
+def _afford(count: float, rule: str, size: str) -> None:
+    """Raise OverBudget for a rule whose `count` points do not fit into memory."""
+    afford(_POINT_BYTES * count, f"{rule}: {count:.3g} points of the pupil", helps=f"ask for fewer {{{size}}}")
 
 
 def gauss_rings(
@@ -51,10 +52,10 @@ def gauss_rings(
 
 @functools.lru_cache(maxsize=64)
 def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of the Gaussian rule of so many points on [-1, 1], those of many points too.
+    """Nodes and weights of the Gaussian rule of `count` points on [-1, 1].
 
-    Beyond a few hundred they are found by Newton's method from Tricomi's estimate, in time count² where the eigenvalues
-    of a matrix take count³: 5000 nodes in 0.1 s, not in a minute (Hale, Townsend, SIAM J. Sci. Comput. 35, 2013, §2).
+    Many points are computed by Newton's method from Tricomi's estimate, in time count² where the eigenvalues of a
+    matrix take count³: 5000 nodes in 0.1 s, not in a minute (Hale, Townsend, SIAM J. Sci. Comput. 35, 2013, §2).
     """
     if count <= _BY_EIGENVALUES:
         return np.polynomial.legendre.leggauss(count)
@@ -156,12 +157,14 @@ def _equal(points: np.ndarray, dtype: torch.dtype, device: torch.device | None) 
     return _tensors(points, np.full(count, 1.0 / count), dtype, device)
 
 
-def _tensors(points: np.ndarray, weights: np.ndarray, dtype, device) -> tuple[Tensor, Tensor]:
+def _tensors(
+    points: np.ndarray, weights: np.ndarray, dtype: torch.dtype, device: torch.device | None
+) -> tuple[Tensor, Tensor]:
     return torch.as_tensor(points, dtype=dtype, device=device), torch.as_tensor(weights, dtype=dtype, device=device)
 
 
-#: Samplings by name, each called with one size: rings, points across, or points; and that size where none is given.
-SAMPLINGS = {
+#: Samplings by name: the rule, the option of its size (rings, points across, or points) and the default of that size.
+SAMPLINGS: dict[str, tuple[Callable[..., tuple[Tensor, Tensor]], str, int]] = {
     "gauss": (gauss_rings, "rings", 12),
     "hexapolar": (hexapolar, "rings", 12),
     "square": (square, "points", 32),
@@ -190,11 +193,10 @@ def sampled(
     given = {"rings": rings, "points": points}
     wrong = "points" if counted == "rings" else "rings"
     if given[wrong] is not None:
-        takers = ", ".join(name for name, (_, what, _) in SAMPLINGS.items() if what == wrong)
-        takers = option("sampling", takers)
+        takers = option("sampling", ", ".join(name for name, row in SAMPLINGS.items() if row[1] == wrong))
         raise ValueError(f"{option(wrong)} belongs to {takers}; {sampling} takes {option(counted)}")
-    own = {"seed": seed} if rule in (sobol, random) else {}
-    return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)
+    seeds = {"seed": seed} if rule in (sobol, random) else {}
+    return rule(size if given[counted] is None else given[counted], **seeds, dtype=dtype, device=device)
 
 
 @value

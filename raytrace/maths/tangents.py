@@ -14,14 +14,18 @@ Source: Griewank & Walther, Evaluating Derivatives, 2008, ch. 3 (vector forward 
 import contextlib
 import contextvars
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NoReturn, TypeAlias
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import plain_functions
+from raytrace.maths.numerics import Number, plain_functions
+
+#: Axes of a reduction.
+Axes: TypeAlias = int | tuple[int, ...] | list[int]
 
 _stopped: contextvars.ContextVar[bool] = contextvars.ContextVar("stopped", default=False)
 
@@ -31,7 +35,7 @@ class MovingTensor(Tensor):
 
     tangents: Tensor
 
-    # As of the tangents, which torch reads without asking this class.
+    # Those of the tangents; torch reads them without `__torch_function__`.
     shape = property(lambda self: self.tangents.shape[1:])
     dtype = property(lambda self: self.tangents.dtype)
     device = property(lambda self: self.tangents.device)
@@ -44,7 +48,9 @@ class MovingTensor(Tensor):
         return self.tangents.is_floating_point()
 
     @classmethod
-    def __torch_function__(cls, function, types, arguments=(), options=None):
+    def __torch_function__(
+        cls, function: Callable, types: object, arguments: tuple = (), options: dict | None = None
+    ) -> Any:
         options = options or {}
         with plain_functions():
             if _stopped.get() or not torch.is_grad_enabled():
@@ -52,9 +58,12 @@ class MovingTensor(Tensor):
             rule = RULES.get(function)
             return _by_torch(function, arguments, options) if rule is None else rule(*arguments, **options)
 
-    def __repr__(self) -> str:
+    def __repr__(self, *, tensor_contents: object = None) -> str:  # type: ignore[override]  # untyped in torch
         with plain_functions():
             return f"{self.as_subclass(Tensor)!r} with derivatives by {len(self.tangents)} variables"
+
+
+Several: TypeAlias = tuple[MovingTensor, ...]
 
 
 def with_tangents(value: Tensor, tangents: Tensor) -> MovingTensor:
@@ -79,7 +88,7 @@ def value_of(number: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def values_alone() -> Iterator[None]:
-    """Within the block, results carry no derivatives by variables: for searches whose steps nobody differentiates."""
+    """Within the block, results carry no derivatives by variables: for searches whose steps are not differentiated."""
     token = _stopped.set(True)
     try:
         yield
@@ -87,8 +96,8 @@ def values_alone() -> Iterator[None]:
         _stopped.reset(token)
 
 
-def _values(result):
-    """What a function returns, without tangents."""
+def _values(result: Any) -> Any:
+    """The result of a function without tangents."""
     if isinstance(result, MovingTensor):
         return result.as_subclass(Tensor)
     if isinstance(result, (tuple, list)) and any(isinstance(entry, MovingTensor) for entry in result):
@@ -100,7 +109,7 @@ def _values(result):
 
 
 def _under(tangents: Tensor, dim: int) -> Tensor:
-    """Tangents (n, ...) with so many axes behind the first, for values of `dim` axes."""
+    """Tangents (n, ...) with `dim` axes behind the first, for values of `dim` axes."""
     missing = dim + 1 - tangents.dim()
     return tangents.reshape(len(tangents), *(1,) * missing, *tangents.shape[1:]) if missing > 0 else tangents
 
@@ -111,9 +120,9 @@ def _full(tangents: Tensor, value: Tensor) -> Tensor:
     return tangents if tangents.shape == shape else _under(tangents, value.dim()).expand(shape)
 
 
-def _sum(value: Tensor, parts: Sequence[tuple[Tensor, object]]) -> MovingTensor:
-    """The value with tangents Σ dx ∂y/∂x of parts (x, ∂y/∂x), those that move; ∂y/∂x None: 1."""
-    total = None
+def _sum(value: Tensor, parts: Iterable[tuple[Number, Number]]) -> MovingTensor:
+    """The value with tangents Σ dx ∂y/∂x of parts (x, ∂y/∂x), one of which at least has tangents; ∂y/∂x None: 1."""
+    total: Any = None
     for x, slope in parts:
         if not isinstance(x, MovingTensor):
             continue
@@ -127,19 +136,19 @@ def _sum(value: Tensor, parts: Sequence[tuple[Tensor, object]]) -> MovingTensor:
     return with_tangents(value, _full(total, value))
 
 
-def _add(a, b, *, alpha=1):
+def _add(a: Number, b: Number, *, alpha: float = 1) -> MovingTensor:
     return _sum(torch.add(a, b, alpha=alpha), ((a, None), (b, None if alpha == 1 else alpha)))
 
 
-def _subtract(a, b, *, alpha=1):
+def _subtract(a: Number, b: Number, *, alpha: float = 1) -> MovingTensor:
     return _sum(torch.sub(a, b, alpha=alpha), ((a, None), (b, -alpha)))
 
 
-def _multiply(a, b):
+def _multiply(a: Number, b: Number) -> MovingTensor:
     return _sum(a * b, ((a, b), (b, a)))
 
 
-def _divide(a, b, *, rounding_mode=None):
+def _divide(a: Number, b: Number, *, rounding_mode: str | None = None) -> Tensor:
     if rounding_mode is not None:
         return torch.div(a, b, rounding_mode=rounding_mode)
     ratio = a / b
@@ -147,7 +156,7 @@ def _divide(a, b, *, rounding_mode=None):
     return _sum(ratio, ((a, inverse), (b, -ratio * inverse)))
 
 
-def _power(x, exponent):
+def _power(x: Number, exponent: Number) -> MovingTensor:
     value = torch.pow(x, exponent)
     by_x = exponent * torch.pow(x, exponent - 1) if isinstance(x, MovingTensor) else None
     by_exponent = (
@@ -156,23 +165,23 @@ def _power(x, exponent):
     return _sum(value, ((x, by_x), (exponent, by_exponent)))
 
 
-def _add_product(x, a, b, *, value=1):
+def _add_product(x: Tensor, a: Tensor, b: Tensor, *, value: float = 1) -> MovingTensor:
     by_a, by_b = (b, a) if value == 1 else (value * b, value * a)
     return _sum(torch.addcmul(x, a, b, value=value), ((x, None), (a, by_a), (b, by_b)))
 
 
-def _angle(y, x):
+def _angle(y: Tensor, x: Tensor) -> MovingTensor:
     square = x * x + y * y
     return _sum(torch.atan2(y, x), ((y, x / square), (x, -y / square)))
 
 
-def _signed(x, sign):
-    """The rule of |x| with the sign of another, of which it is no function between its jumps."""
+def _signed(x: Tensor, sign: Number) -> Tensor:
+    """The rule of |x| with the sign of another number, which changes the result in jumps alone."""
     value = torch.copysign(x, sign)
     return _sum(value, ((x, torch.sign(x) * torch.sign(value)),)) if isinstance(x, MovingTensor) else value
 
 
-def _length_of_two(a, b):
+def _length_of_two(a: Tensor, b: Tensor) -> MovingTensor:
     length = torch.hypot(a, b)
     safe = torch.where(length == 0, torch.ones_like(length), length)
     return _sum(length, ((a, a / safe), (b, b / safe)))
@@ -181,7 +190,7 @@ def _length_of_two(a, b):
 def _extreme(function: Callable) -> Callable:
     """The larger or smaller of two; equal ones have half of the derivative each, as in torch."""
 
-    def rule(a, b):
+    def rule(a: Tensor, b: Tensor) -> MovingTensor:
         value = function(a, b)
         share = torch.where(a == b, 0.5, (a == value).to(value.dtype))
         return _sum(value, ((a, share), (b, 1 - share)))
@@ -189,31 +198,32 @@ def _extreme(function: Callable) -> Callable:
     return rule
 
 
-def _where(condition, a, b):
-    value, zero = torch.where(condition, a, b), 0.0
+def _where(condition: Tensor, a: Number, b: Number) -> MovingTensor:
+    value = torch.where(condition, a, b)
     count = next(len(x.tangents) for x in (a, b) if isinstance(x, MovingTensor))
-    parts = [_under(x.tangents, value.dim()) if isinstance(x, MovingTensor) else zero for x in (a, b)]
-    chosen = torch.where(condition, *parts)
+    moved_a, moved_b = (_under(x.tangents, value.dim()) if isinstance(x, MovingTensor) else 0.0 for x in (a, b))
+    chosen = torch.where(condition, moved_a, moved_b)
     return with_tangents(
         value, chosen.expand(count, *value.shape) if chosen.dim() <= value.dim() else _full(chosen, value)
     )
 
 
-def _complex(real, imaginary):
+def _complex(real: Tensor, imaginary: Tensor) -> MovingTensor:
     value = torch.complex(real, imaginary)
     count = next(len(x.tangents) for x in (real, imaginary) if isinstance(x, MovingTensor))
     parts = [_full(tangents_of(x, count), value) for x in (real, imaginary)]
     return with_tangents(value, torch.complex(*parts))
 
 
-def _contracted(equation, *operands):
+def _contracted(equation: str, *operands: Any) -> Tensor:
     """The rule of einsum: multilinear, an axis of variables goes with each operand in turn."""
-    operands = operands[0] if len(operands) == 1 and isinstance(operands[0], (list, tuple)) else operands
+    operands = tuple(operands[0]) if len(operands) == 1 and isinstance(operands[0], (list, tuple)) else operands
     terms, arrow, result = equation.replace(" ", "").partition("->")
     if not arrow:
         return _by_torch(torch.einsum, (equation, *operands), {})
     letter = next(c for c in "zyxwvutsrqponmlkjihgfedcba" if c not in equation)
-    values, total = [*map(_values, operands)], 0.0
+    values: list[Tensor] = [*map(_values, operands)]
+    total: Number = 0.0
     for place, operand in enumerate(operands):
         if isinstance(operand, MovingTensor):
             each = [*terms.split(",")]
@@ -223,14 +233,14 @@ def _contracted(equation, *operands):
     return with_tangents(torch.einsum(equation, *values), total)
 
 
-def _absolute(x):
+def _absolute(x: MovingTensor) -> Tensor:
     return _by_torch(torch.abs, (x,), {}) if x.tangents.is_complex() else _through(torch.abs, _UNARY["abs"])(x)
 
 
 def _transformed(function: Callable) -> Callable:
     """The rule of a Fourier transform of torch.fft, linear, over axes counted from the last by default."""
 
-    def rule(x, n=None, dim=None, norm=None, **options):
+    def rule(x: MovingTensor, n: Any = None, dim: Any = None, norm: str | None = None, **options: Any) -> MovingTensor:
         last = "s" if function.__name__.endswith(("2", "n")) else "n"
         axes = {} if dim is None else {"dim": dim}
         if dim is None and function.__name__.endswith("n"):
@@ -244,24 +254,24 @@ def _transformed(function: Callable) -> Callable:
     return rule
 
 
-def _through(function: Callable, slope: Callable[[Tensor, Tensor], object]) -> Callable:
+def _through(function: Callable, slope: Callable[[Tensor, Tensor], Number]) -> Callable:
     """The rule of a function of one tensor; slope(x, y): its derivative."""
 
-    def rule(x, **options):
+    def rule(x: MovingTensor, **options: Any) -> MovingTensor:
         value = function(x, **options)
         return with_tangents(value, x.tangents * slope(_values(x), value))
 
     return rule
 
 
-def _clamped(x, min=None, max=None):
+def _clamped(x: MovingTensor, min: Number = None, max: Number = None) -> Tensor:
     value = torch.clamp(x, min, max)
     if isinstance(min, MovingTensor) or isinstance(max, MovingTensor):
         return _by_torch(torch.clamp, (x, min, max), {})
     return with_tangents(value, x.tangents * (value == x))
 
 
-def _shifted(dim):
+def _shifted(dim: Any) -> Any:
     """Axes of values as axes of tangents."""
     if isinstance(dim, (tuple, list)):
         return type(dim)(map(_shifted, dim))
@@ -274,7 +284,7 @@ def _linear(function: Callable, *, axes: Sequence[str] = ("dim",), first: int | 
     axes: names of options that are axes; first: the place of the first argument that is one, all behind it are, too.
     """
 
-    def rule(x, *arguments, **options):
+    def rule(x: MovingTensor, *arguments: Any, **options: Any) -> MovingTensor | Several:
         value = function(x, *arguments, **options)
         shifted = arguments if first is None else (*arguments[:first], *map(_shifted, arguments[first:]))
         moved = {name: _shifted(option) if name in axes else option for name, option in options.items()}
@@ -286,35 +296,35 @@ def _linear(function: Callable, *, axes: Sequence[str] = ("dim",), first: int | 
     return rule
 
 
-def _shape_of(arguments) -> tuple[int, ...]:
+def _shape_of(arguments: tuple) -> tuple[int, ...]:
     return tuple(arguments[0]) if len(arguments) == 1 and not isinstance(arguments[0], int) else arguments
 
 
-def _reshape(x, *shape, **options):
+def _reshape(x: MovingTensor, *shape: Any, **options: Any) -> MovingTensor:
     value = x.reshape(*shape, **options)
     return with_tangents(value, x.tangents.reshape(len(x.tangents), *value.shape))
 
 
-def _expand(x, *shape, **options):
+def _expand(x: MovingTensor, *shape: Any, **options: Any) -> MovingTensor:
     value = x.expand(*shape, **options)
     return with_tangents(value, _full(x.tangents, value))
 
 
-def _split(x, split_size, dim=0):
+def _split(x: MovingTensor, split_size: Any, dim: int = 0) -> Several:
     parts = zip(torch.split(x, split_size, dim), torch.split(x.tangents, split_size, _shifted(dim)), strict=True)
     return tuple(with_tangents(*part) for part in parts)
 
 
-def _permuted(x, dims):
+def _permuted(x: MovingTensor, dims: tuple[int, ...]) -> MovingTensor:
     count = x.tangents.dim() - 1
     return with_tangents(x.permute(dims), x.tangents.permute(0, *(dim % count + 1 for dim in dims)))
 
 
-def _finite(x, *arguments, **options):
+def _finite(x: MovingTensor, *arguments: Any, **options: Any) -> MovingTensor:
     return with_tangents(torch.nan_to_num(x, *arguments, **options), x.tangents * torch.isfinite(x))
 
 
-def _crossed(a, b, dim=-1):
+def _crossed(a: Tensor, b: Tensor, dim: int = -1) -> MovingTensor:
     """The rule of the vector product along an axis."""
     value = torch.linalg.cross(a, b, dim=dim)
     count = next(len(x.tangents) for x in (a, b) if isinstance(x, MovingTensor))
@@ -323,43 +333,41 @@ def _crossed(a, b, dim=-1):
     return with_tangents(value, torch.linalg.cross(a_by, b, dim=axis) + torch.linalg.cross(a, b_by, dim=axis))
 
 
-def _flipped(x, dims):
+def _flipped(x: MovingTensor, dims: tuple[int, ...]) -> MovingTensor:
     return with_tangents(x.flip(dims), x.tangents.flip(_shifted(dims)))
 
 
-def _flatten(x, start_dim=0, end_dim=-1):
+def _flatten(x: MovingTensor, start_dim: int = 0, end_dim: int = -1) -> MovingTensor:
     value = x.flatten(start_dim, end_dim)
     return with_tangents(value, x.tangents.reshape(len(x.tangents), *value.shape))
 
 
-def _unbind(x, dim=0):
+def _unbind(x: MovingTensor, dim: int = 0) -> Several:
     values, tangents = x.unbind(dim), x.tangents.unbind(_shifted(dim))
     return tuple(map(with_tangents, values, tangents))
 
 
-def _sum_over(x, dim=None, keepdim=False, *, dtype=None):
-    value = x.sum(dtype=dtype) if dim is None else x.sum(dim, keepdim, dtype=dtype)
-    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
-    dim = tuple(range(x.dim())) if len(dim) == 0 else dim
-    moved = x.tangents if x.dim() == 0 else x.tangents.sum(_shifted(dim), keepdim, dtype=dtype)
-    return with_tangents(value, moved)
+def _reduced(function: Callable) -> Callable:
+    """The rule of sum and mean, over all axes without `dim`."""
+
+    def rule(
+        x: MovingTensor, dim: Axes | None = None, keepdim: bool = False, *, dtype: torch.dtype | None = None
+    ) -> MovingTensor:
+        value = function(x, dtype=dtype) if dim is None else function(x, dim, keepdim, dtype=dtype)
+        axes = (dim,) if isinstance(dim, int) else tuple(dim or range(x.dim()))
+        return with_tangents(value, function(x.tangents, _shifted(axes), keepdim, dtype=dtype) if axes else x.tangents)
+
+    return rule
 
 
-def _mean_over(x, dim=None, keepdim=False, *, dtype=None):
-    value = x.mean(dtype=dtype) if dim is None else x.mean(dim, keepdim, dtype=dtype)
-    dim = tuple(range(x.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
-    moved = x.tangents if x.dim() == 0 else x.tangents.mean(_shifted(dim), keepdim, dtype=dtype)
-    return with_tangents(value, moved)
-
-
-def _cumulated(x, dim, *, dtype=None):
+def _cumulated(x: MovingTensor, dim: int, *, dtype: torch.dtype | None = None) -> MovingTensor:
     return with_tangents(x.cumsum(dim, dtype=dtype), x.tangents.cumsum(_shifted(dim), dtype=dtype))
 
 
 def _joined(function: Callable) -> Callable:
     """The rule of `stack` and `cat`."""
 
-    def rule(tensors, dim=0):
+    def rule(tensors: Sequence[Tensor], dim: int = 0) -> MovingTensor:
         tensors = list(tensors)
         value = function(tensors, dim)
         count = next(len(x.tangents) for x in tensors if isinstance(x, MovingTensor))
@@ -368,8 +376,8 @@ def _joined(function: Callable) -> Callable:
     return rule
 
 
-def _broadcast(*tensors):
-    tensors = tensors[0] if len(tensors) == 1 and not isinstance(tensors[0], Tensor) else tensors
+def _broadcast(*tensors: Any) -> tuple[Tensor, ...]:
+    tensors = tuple(tensors[0]) if len(tensors) == 1 and not isinstance(tensors[0], Tensor) else tensors
     values = torch.broadcast_tensors(*tensors)
     return tuple(
         with_tangents(value, _full(x.tangents, value)) if isinstance(x, MovingTensor) else _values(value)
@@ -377,21 +385,21 @@ def _broadcast(*tensors):
     )
 
 
-def _entries(x, place):
+def _entries(x: Tensor, place: Any) -> Tensor:
     if not isinstance(x, MovingTensor):
         return _values(x[_values(place)])
     place = place if isinstance(place, tuple) else (place,)
     return with_tangents(x[place], x.tangents[(slice(None), *place)])
 
 
-def _converted(x, *arguments, **options):
+def _converted(x: MovingTensor, *arguments: Any, **options: Any) -> Tensor:
     value = x.to(*arguments, **options)
     if not _is_continuous(value):
         return value
     return with_tangents(value, x.tangents.to(dtype=value.dtype, device=value.device))
 
 
-def _copied(x, dim, index, source):
+def _copied(x: Tensor, dim: int, index: Tensor, source: Tensor) -> MovingTensor:
     """The rule of index_copy."""
     value = torch.index_copy(x, dim, index, source)
     count = next(len(part.tangents) for part in (x, source) if isinstance(part, MovingTensor))
@@ -399,7 +407,7 @@ def _copied(x, dim, index, source):
     return with_tangents(value, moved)
 
 
-def _gathered(x, dim, index):
+def _gathered(x: Tensor, dim: int, index: Tensor) -> Tensor:
     if not isinstance(x, MovingTensor):
         return torch.gather(x, dim, _values(index))
     value = torch.gather(x, dim, index)
@@ -410,7 +418,7 @@ def _gathered(x, dim, index):
 def _chosen_along(function: Callable) -> Callable:
     """The rule of amax and amin over axes: the mean of the derivatives of all entries equal to it, as in torch."""
 
-    def rule(x, dim=(), keepdim=False):
+    def rule(x: MovingTensor, dim: Axes = (), keepdim: bool = False) -> MovingTensor:
         value = function(x, dim, keepdim)
         dim = tuple(range(x.dim())) if dim == () else (dim,) if isinstance(dim, int) else tuple(dim)
         kept = function(x, dim, True)
@@ -424,7 +432,7 @@ def _chosen_along(function: Callable) -> Callable:
 def _chosen(function: Callable) -> Callable:
     """The rule of max and min: of one tensor, along an axis, or of two tensors."""
 
-    def rule(x, *arguments, **options):
+    def rule(x: MovingTensor, *arguments: Any, **options: Any) -> Tensor | Several:
         if not arguments and not options:
             return _chosen_along(torch.amax if function is torch.max else torch.amin)(x)
         if arguments and isinstance(arguments[0], Tensor):
@@ -441,7 +449,7 @@ def _chosen(function: Callable) -> Callable:
     return rule
 
 
-def _norm(x, ord=2, dim=None, keepdim=False, **options):
+def _norm(x: MovingTensor, ord: Any = 2, dim: Axes | None = None, keepdim: bool = False, **options: Any) -> Tensor:
     if ord not in (2, None) or dim is None:
         return _by_torch(torch.linalg.vector_norm, (x, ord, dim, keepdim), options)
     length = torch.linalg.vector_norm(x, 2, dim, True)
@@ -451,12 +459,12 @@ def _norm(x, ord=2, dim=None, keepdim=False, **options):
     return with_tangents(torch.linalg.vector_norm(x, 2, dim, keepdim), moved)
 
 
-def _product(a, b):
+def _product(a: Tensor, b: Tensor) -> Tensor:
     """a @ b of matrices, or of batches of them."""
     value = a @ b
     if a.dim() < 2 or b.dim() < 2:
         return _by_torch(torch.matmul, (a, b), {})
-    total = 0.0
+    total: Number = 0.0
     if isinstance(a, MovingTensor):
         total = total + _under(a.tangents, value.dim()) @ _values(b)
     if isinstance(b, MovingTensor):
@@ -464,7 +472,7 @@ def _product(a, b):
     return with_tangents(value, total)
 
 
-def _by_torch(function: Callable, arguments: tuple, options: dict):
+def _by_torch(function: Callable, arguments: tuple, options: dict) -> Any:
     """By torch's forward derivatives, one for each variable; of functions without derivatives their values alone."""
     name = getattr(function, "__name__", "")
     if (name.endswith("_") and not name.endswith("__")) or name in ("__setitem__", "__set__"):
@@ -483,8 +491,8 @@ def _by_torch(function: Callable, arguments: tuple, options: dict):
             given = [*map(_values, leaves)]
             for place in moving:
                 given[place] = forward_ad.make_dual(given[place], leaves[place].tangents[k].contiguous())
-            positional, named = pytree.tree_unflatten(given, form)
-            slopes.append(pytree.tree_map_only(Tensor, _forward_derivative, function(*positional, **named)))
+            positional, by_name = pytree.tree_unflatten(given, form)
+            slopes.append(pytree.tree_map_only(Tensor, _forward_derivative, function(*positional, **by_name)))
     flat, tree = pytree.tree_flatten(result)
     columns = zip(*map(pytree.tree_leaves, slopes), strict=True)
     parts = [
@@ -498,15 +506,22 @@ def _is_continuous(number: Tensor) -> bool:
     return number.is_floating_point() or number.is_complex()
 
 
-def _gradient(outputs, inputs, grad_outputs=None, retain_graph=None, create_graph=False, **options):
+def _gradient(
+    outputs: Tensor | Sequence[Tensor],
+    inputs: Tensor | Sequence[Tensor],
+    grad_outputs: Tensor | Sequence[Tensor | None] | None = None,
+    retain_graph: bool | None = None,
+    create_graph: bool = False,
+    **options: Any,
+) -> tuple[MovingTensor | None, ...]:
     """The rule of `torch.autograd.grad`: the gradients of the values, whose tangents are the gradients of tangents."""
     outputs = (outputs,) if isinstance(outputs, Tensor) else tuple(outputs)
-    weights = (grad_outputs,) if isinstance(grad_outputs, Tensor) else grad_outputs
-    weights = [None] * len(outputs) if weights is None else [*weights]
+    shared = [grad_outputs] if isinstance(grad_outputs, Tensor) else grad_outputs
+    weights = [None] * len(outputs) if shared is None else [*shared]
     count = next(len(x.tangents) for x in (*outputs, *weights) if isinstance(x, MovingTensor))
     how = {**options, "retain_graph": True, "create_graph": create_graph, "allow_unused": True}
     values = torch.autograd.grad([*map(_values, outputs)], inputs, [*map(_values, weights)], **how)
-    columns = []
+    columns: list[Sequence[Tensor | None]] = []
     for k in range(count):
         terms = [(tangents_of(output, count)[k], _values(w)) for output, w in zip(outputs, weights, strict=True)]
         terms += [
@@ -534,10 +549,11 @@ def _forward_derivative(number: Tensor) -> Tensor:
     return torch.zeros_like(number) if tangent is None else tangent.clone()
 
 
-def applied(function: type[torch.autograd.Function], *arguments, slopes: Callable | None = None):
-    """A function with derivatives of its own, which torch's functions do not see.
+def applied(function: type[torch.autograd.Function], *arguments: Any, slopes: Callable | None = None) -> Any:
+    """The result of a torch.autograd.Function, with tangents where its arguments have them.
 
-    slopes(*arguments): of one that acts entry by entry, its derivatives by the first arguments; else it has a `jvp`.
+    slopes(*arguments): the derivatives by the first arguments of a function that acts entry by entry; without them, the
+    function needs a `jvp`.
     """
     if not any(isinstance(argument, MovingTensor) for argument in arguments):
         return function.apply(*arguments)
@@ -548,7 +564,7 @@ def applied(function: type[torch.autograd.Function], *arguments, slopes: Callabl
         return _sum(function.apply(*values), [*zip(arguments, slopes(*values), strict=False)])
 
 
-def _no_array(x, *arguments, **options):
+def _no_array(x: Tensor, *arguments: object, **options: object) -> NoReturn:
     raise RuntimeError("a tensor with derivatives by variables has no array: its numbers are those of x.detach()")
 
 
@@ -593,22 +609,33 @@ _MOVES = {
     "roll": 1,
 }
 
-#: Rules by function of torch: what a function returns with its tangents.
+#: Rules by function of torch: its result with tangents.
 RULES: dict[Callable, Callable] = {}
 
 
-def _row(names: Sequence[str], rule: Callable | None, *, of_first: bool = False) -> None:
-    """A rule for a function of torch, of tensors and of the operators; of_first: of its first argument alone."""
+def _functions(*names: str) -> Iterator[Callable]:
+    """The functions of torch, of tensors and of torch.linalg that have these names."""
     for name in names:
         for home in (torch, Tensor, torch.linalg):
             if (function := getattr(home, name, None)) is not None:
-                RULES[function] = _of_first(function, rule) if of_first else rule
+                yield function
+
+
+def _getter(name: str) -> Callable:
+    """The function that reads a property of tensors."""
+    return getattr(Tensor, name).__get__
+
+
+def _row(names: Sequence[str], rule: Callable, *, of_first: bool = False) -> None:
+    """A rule for a function of torch by its names; of_first: of its first argument alone."""
+    for function in _functions(*names):
+        RULES[function] = _of_first(function, rule) if of_first else rule
 
 
 def _of_first(function: Callable, rule: Callable) -> Callable:
-    """The rule of a function that is differentiable by its first argument; others only tell sizes and places."""
+    """The rule of a function that is differentiable by its first argument; others are sizes and indices."""
 
-    def chosen(x, *arguments, **options):
+    def chosen(x: Tensor, *arguments: Any, **options: Any) -> Any:
         if isinstance(x, MovingTensor):
             return rule(x, *map(_values, arguments), **options)
         return _values(function(x, *map(_values, arguments), **options))
@@ -666,8 +693,8 @@ _row(["unbind"], _unbind, of_first=True)
 _row(["stack"], _joined(torch.stack))
 _row(["cat", "concatenate", "concat"], _joined(torch.cat))
 _row(["broadcast_tensors"], _broadcast)
-_row(["sum"], _sum_over, of_first=True)
-_row(["mean"], _mean_over, of_first=True)
+_row(["sum"], _reduced(torch.sum), of_first=True)
+_row(["mean"], _reduced(torch.mean), of_first=True)
 _row(["cumsum"], _cumulated, of_first=True)
 _row(["gather"], _gathered)
 _row(["index_copy"], _copied)
@@ -679,49 +706,32 @@ _row(["double"], lambda x: _converted(x, torch.float64), of_first=True)
 _row(["float"], lambda x: _converted(x, torch.float32), of_first=True)
 _row(["clone", "contiguous"], lambda x, **options: with_tangents(x.clone(), x.tangents))
 _row(["detach"], lambda x: x.as_subclass(Tensor).detach())
-_row(
-    [
-        *(
-            "gt",
-            "lt",
-            "ge",
-            "le",
-            "eq",
-            "ne",
-            "__gt__",
-            "__lt__",
-            "__ge__",
-            "__le__",
-            "__eq__",
-            "__ne__",
-            "greater",
-            "less",
-        ),
-        *("isfinite", "isnan", "isinf", "isclose", "allclose", "equal", "any", "all", "argmax", "argmin", "argsort"),
-        *("item", "tolist", "__bool__", "__float__", "__int__", "__len__", "numel", "nelement", "size", "stride"),
-        *("is_contiguous", "element_size", "is_complex", "searchsorted", "bucketize", "nonzero"),
-        "zeros_like",
-        "ones_like",
-        "full_like",
-        "empty_like",
-        "new_zeros",
-        "new_ones",
-        "new_tensor",
-        "new_full",
-        "new_empty",
-        "sign",
-        "floor",
-        "ceil",
-        "round",
-        "trunc",
-        "heaviside",
-    ],
-    None,
-)
-for _function in [function for function, rule in RULES.items() if rule is None]:
+for _function in _functions(
+    *(
+        "gt",
+        "lt",
+        "ge",
+        "le",
+        "eq",
+        "ne",
+        "__gt__",
+        "__lt__",
+        "__ge__",
+        "__le__",
+        "__eq__",
+        "__ne__",
+        "greater",
+        "less",
+    ),
+    *("isfinite", "isnan", "isinf", "isclose", "allclose", "equal", "any", "all", "argmax", "argmin", "argsort"),
+    *("item", "tolist", "__bool__", "__float__", "__int__", "__len__", "numel", "nelement", "size", "stride"),
+    *("is_contiguous", "element_size", "is_complex", "searchsorted", "bucketize", "nonzero"),
+    *("zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_tensor", "new_full"),
+    *("new_empty", "sign", "floor", "ceil", "round", "trunc", "heaviside"),
+):
     RULES[_function] = _constant(_function)
 for _property in ("requires_grad", "grad_fn", "is_leaf", "is_meta", "is_cuda", "layout", "is_sparse", "is_quantized"):
-    RULES[getattr(Tensor, _property).__get__] = _constant(getattr(Tensor, _property).__get__)
+    RULES[_getter(_property)] = _constant(_getter(_property))
 for _name in ("fft", "ifft", "rfft", "irfft", "fft2", "ifft2", "rfft2", "irfft2", "fftn", "ifftn"):
     RULES[getattr(torch.fft, _name)] = _of_first(getattr(torch.fft, _name), _transformed(getattr(torch.fft, _name)))
 for _name in ("fftshift", "ifftshift"):
@@ -731,8 +741,8 @@ for _function in (
     torch.real,
     torch.imag,
     torch.conj,
-    Tensor.real.__get__,
-    Tensor.imag.__get__,
+    _getter("real"),
+    _getter("imag"),
     Tensor.conj,
     torch.view_as_real,
     torch.view_as_complex,
@@ -740,14 +750,14 @@ for _function in (
     RULES[_function] = _linear(_function)
 RULES[torch.complex], RULES[torch.einsum] = _complex, _contracted
 RULES[torch.autograd.grad] = _gradient
-RULES[Tensor.data.__get__] = _constant(Tensor.data.__get__)
+RULES[_getter("data")] = _constant(_getter("data"))
 RULES[Tensor.numpy] = RULES[Tensor.__array__] = RULES[Tensor.data_ptr] = _no_array
 RULES[torch.functional.broadcast_tensors] = _broadcast
 RULES[torch.where] = _where
 RULES[Tensor.where] = lambda x, condition, other: _where(condition, x, other)
 RULES[Tensor.unflatten] = lambda x, dim, sizes: _reshape(x, x.as_subclass(Tensor).unflatten(dim, sizes).shape)
-RULES[Tensor.T.__get__] = lambda x: with_tangents(
+RULES[_getter("T")] = lambda x: with_tangents(
     x.as_subclass(Tensor).T,
     x.tangents.movedim(tuple(range(1, x.tangents.dim())), tuple(range(x.tangents.dim() - 1, 0, -1))),
 )
-RULES[Tensor.mT.__get__] = lambda x: with_tangents(x.as_subclass(Tensor).mT, x.tangents.mT)
+RULES[_getter("mT")] = lambda x: with_tangents(x.as_subclass(Tensor).mT, x.tangents.mT)

@@ -16,21 +16,17 @@ from raytrace.words import option
 
 Order = tuple[int, int]
 
+#: By |m|, for k = 0, 1, … the polynomial P_k^(0, |m|)(t) and its derivatives.
+Jacobi = dict[int, list[tuple[Tensor, ...]]]
+
 
 def noll(j: int) -> Order:
     """(n, m) of Noll's j = 1, 2, …: piston, tilt x, tilt y, focus, astigmatism sin, cos, coma y, x, …"""
-    _at_least(j, 1, "Noll")
+    _refuse_zero(j, "Noll")
     n = math.isqrt(8 * j - 7) - 1 >> 1
     k = j - n * (n + 1) // 2
     m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k - 1) // 2) + 1
     return n, m if j % 2 == 0 else -m
-
-
-def ansi(j: int) -> Order:
-    """(n, m) of the ANSI Z80.28 index j = (n (n + 2) + m)/2 = 0, 1, …"""
-    _at_least(j, 0, "ANSI")
-    n = (math.isqrt(8 * j + 1) - 1) // 2
-    return n, 2 * j - n * (n + 2)
 
 
 def fringe(j: int) -> Order:
@@ -39,7 +35,7 @@ def fringe(j: int) -> Order:
     But j = 37 is (12, 0), the last of the set of 37 that interferometers and lens programs use: the terms that the rule
     puts at 37 to 48 follow it, (6, 6) at 38, and from 50 on the rule holds again.
     """
-    _at_least(j, 1, "fringe")
+    _refuse_zero(j, "fringe")
     if 37 <= j <= 49:
         j = 49 if j == 37 else j - 1
     d = math.isqrt(j - 1) + 1
@@ -47,10 +43,10 @@ def fringe(j: int) -> Order:
     return 2 * (d - 1) - m, -m if (d * d - j) % 2 else m
 
 
-#: How terms may be numbered: the order (n, m) of the j-th, and whether its polynomial is 1 at the rim or 1 in RMS.
+#: Numberings of the terms: from j to the order (n, m), and whether the polynomial is 1 at the rim or in RMS.
 NUMBERINGS = {"noll": (noll, "rms"), "fringe": (fringe, "rim")}
 
-#: What designers call the terms of low order.
+#: Names of the aberrations of low order.
 WORDS = {
     (0, 0): "piston", (1, 1): "tilt x", (1, -1): "tilt y", (2, 0): "focus", (2, 2): "astigmatism 0°",
     (2, -2): "astigmatism 45°", (3, 1): "coma x", (3, -1): "coma y", (3, 3): "trefoil x", (3, -3): "trefoil y",
@@ -69,10 +65,11 @@ def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
     """Z (J, ...) of orders (n, m) at points (...) of the unit disc.
 
     r^|m| e^{i|m|θ} = (x + iy)^|m| and R_n^m(r)/r^m = P_k^(0, m)(2 r² - 1), k = (n - |m|)/2, by the three-term
-    recurrence of the Jacobi polynomials (DLMF 18.9.2): no digits lost at high orders, no angle, finite
+    recurrence of the Jacobi polynomials (DLMF 18.9.2): full precision at high orders, no angle, finite
     derivatives at the centre.
     """
-    t, pairs, known = 2 * (x * x + y * y) - 1, harmonics(orders, x, y), {}
+    t, pairs = 2 * (x * x + y * y) - 1, harmonics(orders, x, y)
+    known: Jacobi = {}
     terms = [norm(n, m) * jacobi(known, n, m, t)[0] * pairs[abs(m)][0 if m >= 0 else 1] for n, m in orders]
     return torch.stack(terms)
 
@@ -82,13 +79,14 @@ def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
 
     ∇(P H) = H P' 4 (x, y) + P ∇H with d(x + iy)^|m| = |m| (x + iy)^(|m| - 1) (dx + i dy); P' by its recurrence.
     """
-    t, pairs, known = 2 * (x * x + y * y) - 1, harmonics(orders, x, y), {}
-    at, terms = torch.stack([x, y]), []
+    t, pairs = 2 * (x * x + y * y) - 1, harmonics(orders, x, y)
+    known: Jacobi = {}
+    point, terms = torch.stack([x, y]), []
     turned = [(torch.stack([c, -s]), torch.stack([s, c])) for c, s in pairs]
     for n, m in orders:
         size, place, (value, slope) = abs(m), 0 if m >= 0 else 1, jacobi(known, n, m, t, 1)
         by = turned[max(size - 1, 0)][place]
-        terms.append(norm(n, m) * (4 * slope * pairs[size][place] * at + size * value * by))
+        terms.append(norm(n, m) * (4 * slope * pairs[size][place] * point + size * value * by))
     return torch.stack(terms, 1)
 
 
@@ -107,10 +105,10 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -> tuple[Tensor, Tensor]:
-    """`fit` of values (..., P) by weights that share it, and where (...) these determine the coefficients; elsewhere 0.
+    """`fit` of values (..., P), 0 where the weights do not determine the coefficients; and where (...) they do.
 
-    Known are those of a `condition` below `worst`. No derivative is taken by the weights: on what all have in common,
-    the light of a field, no fit depends. Raises ValueError for fewer points than coefficients.
+    They do where the `condition` is below `worst`. No derivative is taken by the weights: a factor that they have in
+    common, the light of a field, does not change the fit. Raises ValueError for fewer points than coefficients.
     """
     refuse_few(weights.shape[-1], len(basis))
     root = torch.sqrt(weights.detach())
@@ -121,7 +119,7 @@ def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -
 
 
 def condition(basis: Tensor, weights: Tensor) -> Tensor:
-    """By how much a fit may enlarge what its values err by (...): 1 on the whole disc, inf for too few points.
+    """The factor (...) by which a fit may enlarge errors of its values: 1 on the whole disc, inf for too few points.
 
     The largest over the smallest singular value of the weighted basis (J, P); weights: (..., P), not negative.
     """
@@ -131,8 +129,8 @@ def condition(basis: Tensor, weights: Tensor) -> Tensor:
 
 def _condition(r: Tensor, root: Tensor) -> Tensor:
     values = torch.linalg.svdvals(r)
-    found = values[..., 0] / values[..., -1].clamp_min(torch.finfo(values.dtype).tiny)
-    return torch.where((root > 0).sum(-1) < r.shape[-1], torch.inf, found)
+    ratio = values[..., 0] / values[..., -1].clamp_min(torch.finfo(values.dtype).tiny)
+    return torch.where((root > 0).sum(-1) < r.shape[-1], torch.inf, ratio)
 
 
 def _solved(values: Tensor, root: Tensor, q: Tensor, r: Tensor) -> Tensor:
@@ -158,9 +156,7 @@ def harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> list[tuple[Tenso
     return pairs
 
 
-def jacobi(
-    known: dict[int, list[tuple[Tensor, ...]]], n: int, m: int, t: Tensor, highest: int = 0
-) -> tuple[Tensor, ...]:
+def jacobi(known: Jacobi, n: int, m: int, t: Tensor, highest: int = 0) -> tuple[Tensor, ...]:
     """P_k^(0, |m|)(t), k = (n - |m|)/2, and its derivatives up to the highest, by the recurrence; extends `known`.
 
     Raises ValueError if no polynomial has the order (n, m).
@@ -186,6 +182,6 @@ def jacobi(
     return rows[k]
 
 
-def _at_least(j: int, first: int, name: str) -> None:
-    if j < first:
-        raise ValueError(f"{name} index {j}: the first is {first}")
+def _refuse_zero(j: int, name: str) -> None:
+    if j < 1:
+        raise ValueError(f"{name} index {j}: the first is 1")

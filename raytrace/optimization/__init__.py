@@ -9,7 +9,11 @@ jacobian          derivatives of rays, merit functions and any function of a len
 evaluate          the value of a merit function row by row, with its table and figure
 problem           constraint syntax; merit function and constraints as the sum of squares of the solver
 least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B
-optimize          `optimize`: opening, descent, targets and attained values, report
+optimize          `optimize`: opening and descent
+opening           rays brought through a lens at which most of them fail
+attained          targets and attained values of conditions and boundaries
+contradictions    conditions that exclude one another
+optimized         `Optimized`, the result of `optimize`; `optimized_figure`: its figure
 checkpoint        state of a descent, from which it resumes
 glass_choice      variable glasses of catalogs
 search            `search`: minima found globally; `search_tasks`, `saddle_points`: its parts

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from raytrace.maths.result import plain
-from raytrace.optimization.least_squares import PATHS, Cycle, PathState, SolverState
+from raytrace.optimization.least_squares import PATHS, Cycle, CycleStart, PathProgress
 from raytrace.stores import (
     Document,
     Kind,
@@ -43,11 +43,11 @@ _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "secon
 
 
 class BadCheckpoint(RaytraceError, ValueError):
-    """Not a checkpoint, or of another optimisation; the message says what was found and what was expected."""
+    """A file that is no checkpoint, or of another optimisation; the message compares found and expected."""
 
 
 class Stored(NamedTuple):
-    """Content of a checkpoint.
+    """The content of a checkpoint.
 
     x: the variables (n,); glasses: of surfaces where they vary, (catalog, name); tested: surfaces at which no exchange
     has helped since the last one; descent: None before it started; evaluated: of a merit that is not a sum of squares,
@@ -57,7 +57,7 @@ class Stored(NamedTuple):
     x: np.ndarray
     glasses: dict[int, tuple[str, str]]
     tested: tuple[int, ...] = ()
-    descent: PathState | None = None
+    descent: PathProgress | None = None
     evaluated: np.ndarray = np.zeros((0, 0))
 
 
@@ -75,19 +75,19 @@ _LOG = dataclasses.replace(_CHECKPOINT, lost="the log ends here")
 class Checkpoint:
     """A file of the state of an optimisation, replaced as a whole.
 
-    {"of": what it depends on, "merit": …, "cycles": …, "variables": {name: number} of the last cycle, at the end of the
+    {"of": the dependencies, "merit": …, "cycles": …, "variables": {name: number} of the last cycle, at the end of the
     best lens, "descent": all that determines the next cycle}; with "glasses": {surface: [catalog, name]} and "tested"
     where glasses vary, and with "evaluated" in the place of "descent" for a merit that is not a sum of squares.
     """
 
-    def __init__(self, path: str | PathLike | None, of: Mapping, names: Sequence[str]):
-        self.store = None if path is None else Document(path, of, _CHECKPOINT)
-        self.names, self.last, self.more = names, -np.inf, {}
+    def __init__(self, path: str | PathLike, about: Mapping[str, object], names: Sequence[str]):
+        self.store, self.names, self.last = Document(path, about, _CHECKPOINT), names, -np.inf
+        self.of_glasses: dict[str, object] = {}
 
     def write_glasses(self, stored: Stored, merit: float) -> None:
         """Write a state of the choice of glasses; later states repeat these glasses."""
         glasses = {str(k): list(glass) for k, glass in stored.glasses.items()}
-        self.more = {"glasses": glasses, "tested": list(stored.tested)}
+        self.of_glasses = {"glasses": glasses, "tested": list(stored.tested)}
         self.write(stored.x, merit, 0, now=True)
 
     def write(
@@ -96,7 +96,7 @@ class Checkpoint:
         merit: float,
         cycles: int,
         *,
-        descent: PathState | None = None,
+        descent: PathProgress | None = None,
         evaluated: Sequence[np.ndarray] = (),
         now: bool = False,
     ) -> None:
@@ -104,10 +104,10 @@ class Checkpoint:
 
         Warns NotWritten where the file cannot be written; the optimisation continues.
         """
-        if self.store is None or (not now and time.monotonic() < self.last + EVERY):
+        if not now and time.monotonic() < self.last + EVERY:
             return
         variables = dict(zip(self.names, x.tolist(), strict=True))
-        document = {"merit": merit, "cycles": cycles, "variables": variables, **self.more}
+        document: dict[str, object] = {"merit": merit, "cycles": cycles, "variables": variables, **self.of_glasses}
         if descent is not None:
             state = descent.solver
             document["descent"] = {
@@ -120,17 +120,17 @@ class Checkpoint:
                 "factor": float(state.factor),
                 "share": float(state.share),
                 "price": float(state.price),
-                "scale": None if state.scale is None else state.scale.tolist(),
+                "scale": state.scale.tolist(),
                 "evaluations": state.evaluations,
                 "history": [list(dataclasses.astuple(cycle)) for cycle in descent.history],
             }
         if evaluated:
-            document["evaluated"] = [plain(one.tolist()) for one in evaluated]
+            document["evaluated"] = [plain(evaluation.tolist()) for evaluation in evaluated]
         self.store.write(document)
         self.last = time.monotonic()
 
 
-def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> Stored:
+def read_checkpoint(path: str | PathLike, about: Mapping[str, object], names: Sequence[str]) -> Stored:
     """The checkpoint of this optimisation. Raises BadCheckpoint and OSError."""
     finite, entry = listed(number(), len(names), len(names)), either(exactly(None), number(infinite=True))
     columns = (whole(), *(number(0),) * 4, whole(), number(), text)
@@ -155,22 +155,22 @@ def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> 
         return Cycle(*(column(cell) for column, cell in zip(columns, cells, strict=True)))
 
     of_solver = {"x": vector, **dict.fromkeys(("damping", "factor", "share", "price"), number(0))}
-    of_solver |= {"scale": either(exactly(None), vector), "evaluations": whole()}
+    of_solver |= {"scale": vector, "evaluations": whole()}
     of_paths = {"path": whole(0, len(PATHS) - 1), "start": vector, "best": either(exactly(None), best)}
     descent_of = record({**of_paths, **of_solver, "before": listed(whole(), 2, 2), "history": listed(cycle)})
 
-    def descent(value: object) -> PathState:
+    def descent(value: object) -> PathProgress:
         stored = descent_of(value)
         (before, evaluations), history = stored["before"], stored["history"]
         if before > len(history):
             raise Unfit("history: expected the cycles of every path")
         cycles = tuple(
-            dataclasses.replace(one, number=one.number - before, evaluations=one.evaluations - evaluations)
-            for one in history[before:]
+            dataclasses.replace(cycle, number=cycle.number - before, evaluations=cycle.evaluations - evaluations)
+            for cycle in history[before:]
         )
-        solver = SolverState(cycles=cycles, **{name: stored[name] for name in of_solver})
+        solver = CycleStart(cycles=cycles, **{name: stored[name] for name in of_solver})
         paths = {name: stored[name] for name in of_paths}
-        return PathState(solver=solver, before=tuple(history[:before]), evaluations=evaluations, **paths)
+        return PathProgress(solver=solver, before=tuple(history[:before]), evaluations=evaluations, **paths)
 
     def check(value: object) -> Stored:
         document = record({}, {"descent": descent})(document_of(value))
@@ -188,22 +188,19 @@ def read_checkpoint(path: str | PathLike, of: Mapping, names: Sequence[str]) -> 
             np.array(document.get("evaluated", []), dtype=float),
         )
 
-    return Document(path, of, _CHECKPOINT).read(check)
+    return Document(path, about, _CHECKPOINT).read(check)
 
 
 class Log:
     """A file of comma-separated values, a line for every cycle; rewritten with the cycles so far."""
 
-    def __init__(self, path: str | PathLike | None, cycles: Sequence[Cycle] = ()):
-        self.store = None
-        if path is not None:
-            self.store, self.table = Store(path, {}, _LOG), Table(path)
-            self.table.begin(_COLUMNS, *map(_cells, cycles))
+    def __init__(self, path: str | PathLike, cycles: Sequence[Cycle] = ()):
+        self.store, self.table = Store(path, {}, _LOG), Table(path)
+        self.table.begin(_COLUMNS, *map(_cells, cycles))
 
     def add(self, cycle: Cycle) -> None:
         """Add a cycle. Warns NotWritten where the file cannot be written; the optimisation continues."""
-        if self.store is not None:
-            self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
+        self.store.keep(lambda: self.table.append(_cells(cycle), sync=False))
 
 
 def _cells(cycle: Cycle) -> list:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ from raytrace.plotting.style import FAINT, field_colours, new_figure, number_tex
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.launch import warn_of_filling
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _WHOLE = 40  # rows up to which each has a line
 _TOGETHER = 3  # rows of one field that share a line in longer tables
@@ -97,7 +101,7 @@ class MeritResult(Result):
             lines.append(f"{lost} rows have lost their ray")
         groups, valued = [*self._groups()], self.valued()
         first = [group[0] for group in groups]
-        columns = {
+        columns: dict[Column, Any] = {
             Column("conf."): self.configurations[first],
             Column("row"): [self._numbers(group) for group in groups],
             Column("operand", form="<"): [valued[k].name for k in first],
@@ -144,7 +148,7 @@ class MeritResult(Result):
             yield from [alike] if len(alike) >= _TOGETHER else ([k] for k in alike)
 
     @styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """A bar for every operand and field, the largest part first; rays of a field share one.
 
         Bars are coloured by operand; the smallest are summed in the last bar.
@@ -202,9 +206,9 @@ def _of_batch(lens: Lens, function: Merit, shown: list[int]) -> MeritsOfBatch:
         merit=safe_sqrt(merits.square()),
         function=function.rows,
         row=torch.tensor([k + 1 for k in shown], dtype=torch.int64),
-        values=torch.as_tensor(np.stack([one.values[shown] for one in each])),
-        contributions=torch.as_tensor(np.stack([one.contributions(shown) for one in each])),
-        lost=torch.as_tensor(np.stack([one.lost[shown] for one in each])),
+        values=torch.as_tensor(np.stack([evaluated.values[shown] for evaluated in each])),
+        contributions=torch.as_tensor(np.stack([evaluated.contributions(shown) for evaluated in each])),
+        lost=torch.as_tensor(np.stack([evaluated.lost[shown] for evaluated in each])),
         unit=function.unit,
     )
 
@@ -222,19 +226,20 @@ def evaluate(
     the file's. configuration: its rows alone. each: list every row in the text. Of a batch the merit (L,) has
     derivatives by every number of the lenses. Raises BadMerit, UnknownOperand.
     """
-    function = merit_for(lens if lens.count is None else lens[0], merit, configuration and [configuration])
+    function = merit_for(
+        lens if lens.count is None else lens[0], merit, configuration if configuration is None else [configuration]
+    )
     if lens.count is None:
         warn_of_filling(lens, field_points(None, like=lens))
     of_rows = configurations_of(function, lens.current_configuration)
     if configuration is not None:
-        function = function.with_weights({k: 0.0 for k, at in enumerate(of_rows, 1) if at != configuration})
+        function = function.with_weights({k: 0.0 for k, of_row in enumerate(of_rows, 1) if of_row != configuration})
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and of_rows[k] in (configuration or of_rows[k],)
     ]
     if lens.count is not None:
         return _of_batch(lens, function, shown)
-    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluation = Evaluation(DesignVariables(lens), function.rows, **options)
+    evaluation = Evaluation(DesignVariables(lens), function.rows, **function.options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
     return MeritResult(
         lens=lens,
@@ -258,9 +263,9 @@ def _shares(result: MeritResult) -> dict[str, tuple[str, float]]:
     several = len({*result.configurations.tolist()}) > 1
     shares: dict[str, tuple[str, float]] = {}
     numbers = (result.row, result.configurations, result.weights, result.contributions)
-    for row, number, at, weight, part in zip(result.valued(), *(n.tolist() for n in numbers), strict=True):
+    for row, number, configuration, weight, part in zip(result.valued(), *(n.tolist() for n in numbers), strict=True):
         if weight:
-            name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
+            name = f"{_name(number, row)}, conf. {configuration}" if several else _name(number, row)
             shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)
     return shares or {"no row has a weight": ("", 0.0)}
 

@@ -1,4 +1,4 @@
-"""What was read from a lens file, the operands of its merit function that are evaluated among it."""
+"""Import report of a lens file, with the operands of its merit function that are evaluated."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,14 +23,16 @@ def check(
     configuration: int | None = None,
     substitute: Substitute = None,
 ) -> ImportReport:
-    """What was read from a lens file, what was not, and where each glass came from; what of its merit is evaluated, and
-    what of the lens cannot be made (`tracing.geometry`).
+    """The import report of a lens file: parts that were read and that were not, the source of each glass, the operands
+    that are evaluated, and surfaces and gaps that cannot be made (`tracing.geometry`).
 
-    strict: raise where something was assumed. configuration: which one has to be such that it can be traced.
-    substitute: as for `read_lens`. Raises as that, and LensFileError for what cannot be traced.
+    strict: raise where something was assumed. configuration: the one that is traced. substitute: as for `read_lens`.
+    Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
     """
-    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
-    lens, report = read_lens_with_report(path, **options, evaluated=(*OPERANDS, *SETTINGS))
+    lens, report = read_lens_with_report(
+        path, catalogs=catalogs, strict=strict, configuration=configuration, substitute=substitute,
+        evaluated=(*OPERANDS, *SETTINGS),
+    )  # fmt: skip
     try:
         check_lens(lens)
     except ValueError as error:

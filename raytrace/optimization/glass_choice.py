@@ -3,7 +3,7 @@
 1. The lens is optimised with its glasses: later steps may not end worse.
 2. Variable glasses become model glasses, whose numbers (n, V, ΔP) stay within the convex hull of the catalogs. The
    lens is optimised with them.
-3. One element at a time, the one that loses most first, takes a glass of the catalogs.
+3. One element at a time takes a glass of the catalogs, first the one whose merit rises most by that.
 4. One glass at a time is exchanged, until no exchange lowers the merit.
 
 An expansion of the merit selects the glasses that are tried. With the derivatives J_y of the residuals r by all other
@@ -16,11 +16,13 @@ so that NJ_p holds Schur's complement of the Hessian. The best few are optimised
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -29,7 +31,7 @@ from scipy.spatial import ConvexHull, QhullError
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
-from raytrace.optimization.least_squares import State, least_squares
+from raytrace.optimization.least_squares import Evaluate, SumOfSquares, least_squares
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
@@ -37,11 +39,11 @@ from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import GLASS
 from raytrace.words import option
 
-_MATTERS = 1e-6  # of the index: what a number of a glass must change of it at the wavelengths, to vary
+_MATTERS = 1e-6  # smallest change of the index at the wavelengths by a number of a glass that varies
 
-#: Statuses that are chosen from; a merit counts so much more with a glass of another than the first.
+#: Statuses of glasses that are chosen, and the factor on the merit with such a glass.
 STATUSES = {"preferred": 1.0, "standard": 1.03, "": 1.03}
-_PRICE = 0.02  # the power of the price, relative to that of the catalog's cheapest sort, by which a merit counts more
+_PRICE = 0.02  # exponent of the relative price of a glass in the factor on the merit
 
 
 class Pool:
@@ -50,10 +52,10 @@ class Pool:
     def __init__(self, glasses: Sequence[Glass], wavelengths: torch.Tensor):
         self.wavelengths, self.basis = wavelengths, _basis(wavelengths)
         self.glasses = tuple(glasses)
-        found = np.array([self.numbers_of(glass) for glass in self.glasses]).reshape(-1, self.count)
-        usable = np.isfinite(found).all(1)
+        numbers = np.array([self.numbers_of(glass) for glass in self.glasses]).reshape(-1, self.count)
+        usable = np.isfinite(numbers).all(1)
         self.glasses = tuple(glass for glass, use in zip(self.glasses, usable, strict=True) if use)
-        self.numbers = found[usable]
+        self.numbers = numbers[usable]
         if not len(self.numbers):
             raise NoProblem(
                 f"no glass of the catalogs covers the wavelengths of the lens; name others by {option('catalog')}"
@@ -66,14 +68,14 @@ class Pool:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What varies of a model glass."""
+        """The numbers of a model glass that vary."""
         return tuple(GLASS)[: self.count]
 
     def numbers_of(self, glass: Glass) -> np.ndarray:
-        """(k,) of the model glass whose indices come nearest at the wavelengths; as many of them are met exactly."""
+        """Numbers (k,) of the model glass whose indices at the wavelengths are nearest, by least squares."""
         excess = refractive_index(glass, self.wavelengths).numpy() - 1
-        found = np.linalg.lstsq(self.basis, excess, rcond=None)[0]
-        n, dispersion, deviation = np.pad(found, (0, 3 - self.count))
+        coefficients = np.linalg.lstsq(self.basis, excess, rcond=None)[0]
+        n, dispersion, deviation = np.pad(coefficients, (0, 3 - self.count))
         if self.count == 1:
             return np.array([1 + n])
         return np.array([1 + n, n / dispersion, deviation / dispersion])[: self.count]
@@ -88,10 +90,10 @@ def _basis(wavelengths: torch.Tensor) -> np.ndarray:
 
     As many of the three, in this order, as change the index at the wavelengths independently.
     """
-    at = lambda *numbers: refractive_index(model_glass(*numbers), wavelengths).numpy() - 1  # noqa: E731
+    excess = lambda *numbers: refractive_index(model_glass(*numbers), wavelengths).numpy() - 1  # noqa: E731
     if len(wavelengths) == 1:
         return np.ones((1, 1))
-    whole, half, deviating = at(2.0, 1.0), at(2.0, 2.0), at(2.0, 1.0, 1.0)
+    whole, half, deviating = excess(2.0, 1.0), excess(2.0, 2.0), excess(2.0, 1.0, 1.0)
     basis = np.stack([2 * half - whole, 2 * (whole - half), deviating - whole], -1)[:, : len(wavelengths)]
     typical = np.array([0.6, 0.012, 1e-4])[: basis.shape[1]]
     new = np.abs(np.diag(np.linalg.qr(basis * typical)[1])) > _MATTERS
@@ -99,29 +101,29 @@ def _basis(wavelengths: torch.Tensor) -> np.ndarray:
 
 
 def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The convex hull of points (G, k): normal (F, k) · p ≤ reach (F,), a length of 1 as large as all of them.
+    """The convex hull of points (G, k): normal (F, k) · p ≤ reach (F,), in units of the range of the points.
 
-    A box where they are too few, or in a plane.
+    A box where the points are too few, or in a plane.
     """
     low, size = points.min(0), np.maximum(np.ptp(points, axis=0), 1e-9)
     scaled = (points - low) / size
     try:
-        found = ConvexHull(scaled).equations
+        planes = ConvexHull(scaled).equations
     except (QhullError, ValueError):
         axes = np.eye(points.shape[1])
-        found = np.concatenate([np.c_[axes, -scaled.max(0)], np.c_[-axes, scaled.min(0)]])
-    found = np.unique(found.round(12), axis=0)
-    normal = found[:, :-1] / size
-    return normal, normal @ low - found[:, -1]
+        planes = np.concatenate([np.c_[axes, -scaled.max(0)], np.c_[-axes, scaled.min(0)]])
+    planes = np.unique(planes.round(12), axis=0)
+    normal = planes[:, :-1] / size
+    return normal, normal @ low - planes[:, -1]
 
 
-def catalogs_of(lens: Lens, catalog: Sequence[str | Path] = ()) -> tuple[Catalog, ...]:
-    """Catalogs by their names or AGF files; without any those that the lens names, else SCHOTT. Raises CatalogError."""
+def catalogs_of(lens: Lens, catalog: Sequence[str | PathLike] = ()) -> tuple[Catalog, ...]:
+    """Catalogs by name or AGF file; by default those of the lens, else SCHOTT. Raises CatalogError and NoProblem."""
     shipped = [name for name in lens.catalogs if name not in missing_catalogs([name])]
     catalogs = []
     for name in catalog or shipped or ("SCHOTT",):
         if Path(name).suffix or Path(name).is_file():
-            catalogs.append(load(name))
+            catalogs.append(load(Path(name)))
             continue
         try:
             catalogs.append(shipped_catalog(str(name)))
@@ -134,17 +136,17 @@ def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
     """Glasses of STATUSES whose range covers the wavelengths of the lens. Raises NoProblem where there is none."""
     shortest, longest = float(lens.wavelengths.min()), float(lens.wavelengths.max())
     span = lambda glass: glass.wavelength_range or (0.0, np.inf)  # noqa: E731
-    found = [
+    glasses = [
         dataclasses.replace(glass, name=glass.listed_name or glass.name)
-        for one in catalogs
-        for glass in one.glasses.values()
+        for catalog in catalogs
+        for glass in catalog.glasses.values()
         if glass.status in STATUSES and span(glass)[0] <= shortest and longest <= span(glass)[1] and not is_air(glass)
     ]
-    return Pool(found, lens.wavelengths)
+    return Pool(glasses, lens.wavelengths)
 
 
 def charge(glass: Glass) -> float:
-    """Factor on the merit of a glass that its maker does not prefer, or that is expensive."""
+    """Factor on the merit with a glass: above 1 if its maker does not prefer it, or if it is expensive."""
     price = next((numbers[0] for keyword, numbers in glass.records if keyword == "OD" and numbers), 0.0)
     return STATUSES.get(glass.status, max(STATUSES.values())) * max(price, 1.0) ** _PRICE
 
@@ -162,10 +164,10 @@ def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:
 TRIED, TRIAL_CYCLES = 4, 15
 _CYCLES = 100  # of a stage
 _ROUNDS = 3  # of exchanges through all elements
-_GAIN = 5e-3  # by which an exchange must make the merit less, as part of it
+_GAIN = 5e-3  # smallest relative reduction of the merit by an exchange
 _DAMPING = 1e-4  # of the variables that follow in the expansion
-_MET = 1e-5  # up to which a condition that is missed counts as met
-_ALIKE = 0.01  # of the width of the hull: glasses that are nearer are not both tried
+_MET = 1e-5  # violation up to which a condition counts as met
+_ALIKE = 0.01  # of the width of the hull: of two glasses that are nearer, one is tried
 
 #: Descriptions of the kinds of steps.
 WORDS = {
@@ -176,11 +178,15 @@ WORDS = {
 }
 
 
+#: Candidates that were optimised: name, predicted and reached merit.
+Trials: TypeAlias = tuple[tuple[str, float, float], ...]
+
+
 @dataclass(frozen=True)
 class GlassStep:
     """One step of the choice.
 
-    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the new glass, 0 and "" of the former two;
+    kind: "own", "model", "snap" or "swap"; surface, name, catalog: of the new glass, 0 and "" of "own" and "model";
     replaced: the glass before. predicted, reached: merits. tried: (name, predicted, reached) of all candidates that
     were optimised.
     """
@@ -193,12 +199,12 @@ class GlassStep:
     catalog: str = ""
     replaced: str = ""
     predicted: float = float("nan")
-    tried: tuple[tuple[str, float, float], ...] = ()
+    tried: Trials = ()
 
-    def document(self) -> dict:
-        named = {"surface": self.surface, "glass": self.name, "catalog": self.catalog, "predicted": self.predicted}
-        tried = [dict(zip(("glass", "predicted", "reached"), one, strict=True)) for one in self.tried]
-        more = {**named, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
+    def document(self) -> dict[str, Any]:
+        of_surface = {"surface": self.surface, "glass": self.name, "catalog": self.catalog, "predicted": self.predicted}
+        tried = [dict(zip(("glass", "predicted", "reached"), trial, strict=True)) for trial in self.tried]
+        more = {**of_surface, "replaced": self.replaced or None, "tried": tried} if self.surface else {}
         return {"step": self.kind, **more, "reached": self.reached, "seconds": round(self.seconds, 3)}
 
     @property
@@ -211,17 +217,23 @@ class GlassStep:
 
 @dataclass(frozen=True)
 class Design:
-    """A state of the choice: variables x (n,) but for glasses, the glasses, and the state of the solver."""
+    """A lens of the choice: variables x (n,) without those of glasses, and the glasses by surface."""
 
     x: np.ndarray
     glasses: dict[int, Glass]
-    state: State
+
+
+@dataclass(frozen=True)
+class DescendedDesign(Design):
+    """A design at the end of a descent, with its merit function there."""
+
+    state: SumOfSquares
 
     @property
     def merit(self) -> float:
         return float(np.sqrt(self.state.cost))
 
-    def rank(self, charged: float = 1.0) -> tuple:
+    def rank(self, charged: float = 1.0) -> tuple[float, float, float]:
         """Fewer failed rays, then conditions met, then a lower merit."""
         missed = float(self.state.missed.max(initial=0.0))
         return self.state.lost, missed if missed > _MET else 0.0, self.merit * charged
@@ -241,10 +253,10 @@ class Expansion:
         return np.sqrt(np.maximum(square, 0.0))
 
 
-def expansion(state: State, own: np.ndarray, following: np.ndarray, fixed: np.ndarray) -> Expansion:
-    """The merit by the variables `own` after `following` ones have followed, conditions met; numbers of columns.
+def expansion(state: SumOfSquares, columns_of_glass: np.ndarray, following: np.ndarray, fixed: np.ndarray) -> Expansion:
+    """The merit by the numbers of a glass, with the `following` variables at their best and the conditions met.
 
-    fixed: (h', n) slopes of limits that are met just so, and stay met.
+    columns_of_glass, following: columns of the Jacobian. fixed: (h', n) slopes of active limits.
     """
     J, r = state.jacobian, state.residuals
     A, c = np.vstack([state.held_slope, fixed]), np.concatenate([state.held, np.zeros(len(fixed))])
@@ -252,7 +264,7 @@ def expansion(state: State, own: np.ndarray, following: np.ndarray, fixed: np.nd
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     back = np.linalg.pinv(A[:, following] / scale) if len(A) else np.zeros((len(following), 0))
     columns = columns / scale
-    r, steep = r - columns @ (back @ c), J[:, own] - columns @ (back @ A[:, own])
+    r, steep = r - columns @ (back @ c), J[:, columns_of_glass] - columns @ (back @ A[:, columns_of_glass])
     free = columns - columns @ (back @ (A[:, following] / scale))
     left, sizes, _ = np.linalg.svd(free, full_matrices=False)
     keep = np.sqrt(_DAMPING / (sizes**2 + _DAMPING))  # N² = (λ/(σ² + λ))² + ridge λ (σ/(σ² + λ))² = λ/(σ² + λ)
@@ -276,7 +288,7 @@ class Choice:
         cycles: int | None = None,
         until: float = np.inf,
         keep: Callable[[Stored, float], None] | None = None,
-        **options,
+        **options: Any,
     ):
         """cycles: of a stage, at most; until: a time of `time.monotonic`; keep: called with the best state while
         glasses are exchanged, and its merit; options: of Problem."""
@@ -285,39 +297,43 @@ class Choice:
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
         self.until, self.started, self.evaluations = until, time.monotonic(), 0
         self.descended = 0  # cycles
-        self.steps, self.keep = [], keep or (lambda stored, merit: None)
+        self.steps: list[GlassStep] = []
+        self.keep = keep or (lambda stored, merit: None)
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
-        """For every surface the glasses and their numbers: of the pool, and its own glass, if of a catalog."""
-        found = {}
+        """The glasses and their numbers for every surface: the pool, and the glass of the surface, if of a catalog."""
+        candidates = {}
         for k in self.surfaces:
-            own, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
-            new = bool(own.catalog) and (own.listed_name or own.name, own.catalog) not in names
-            glasses = (*self.pool.glasses, own) if new else self.pool.glasses
-            numbers = [self.pool.numbers, self.pool.numbers_of(own)[None]] if new else [self.pool.numbers]
-            found[k] = glasses, np.concatenate(numbers)
-        return found
+            glass_of_lens, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
+            new = (
+                bool(glass_of_lens.catalog)
+                and (glass_of_lens.listed_name or glass_of_lens.name, glass_of_lens.catalog) not in names
+            )
+            glasses = (*self.pool.glasses, glass_of_lens) if new else self.pool.glasses
+            numbers = [self.pool.numbers, self.pool.numbers_of(glass_of_lens)[None]] if new else [self.pool.numbers]
+            candidates[k] = glasses, np.concatenate(numbers)
+        return candidates
 
-    def run(self, x: np.ndarray, stored: Stored | None = None) -> Design:
-        """The best design from variables x, which are within their bounds; stored: from where exchanges resume."""
-        own = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
+    def run(self, x: np.ndarray, stored: Stored | None = None) -> DescendedDesign:
+        """The best design from variables x, which are within their bounds; stored: the state to resume."""
+        glasses_of_lens = {k: self.model.lens.surfaces[k].glass for k in self.surfaces}
         if stored is not None and stored.glasses:
-            chosen = own | {k: self._named(k, *one) for k, one in stored.glasses.items()}
-            self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
+            chosen = glasses_of_lens | {k: self._named(k, *stored_glass) for k, stored_glass in stored.glasses.items()}
+            self.best = DescendedDesign(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
             if stored.descent is None:  # else all exchanges were done
                 with suppress(KeyboardInterrupt):  # the best so far
                     self.swap(stored.tested)
             return self.best
-        first = self.descend(Design(x, own, None), (), self.cycles)
+        first = self.descend(Design(x, glasses_of_lens), (), self.cycles)
         self.steps.append(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
-            known = all(glass.catalog for glass in own.values())
+            known = all(glass.catalog for glass in glasses_of_lens.values())
             if known and time.monotonic() > self.until:
                 return first
             snapped = self.snapped(first, known=known)
-            self.best = min(first, snapped, key=Design.rank) if known else snapped
+            self.best = min(first, snapped, key=DescendedDesign.rank) if known else snapped
             self._keep(())
             self.swap()
         return self.best
@@ -329,15 +345,17 @@ class Choice:
                 return glass
         raise BadCheckpoint(f"the checkpoint's glass {name} of {catalog}, surface {surface}: no catalog given has it")
 
-    def _keep(self, tested: Sequence[int]) -> None:
+    def _keep(self, tested: Iterable[int]) -> None:
         glasses = {k: (glass.catalog, glass.name) for k, glass in self.best.glasses.items()}
         self.keep(Stored(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
-    def snapped(self, design: Design, *, known: bool) -> Design:
-        """The design with model glasses first, then with glasses of the catalogs in their places, one by one; as it is
-        where no time is left for that, and its glasses are known ones."""
+    def snapped(self, design: DescendedDesign, *, known: bool) -> DescendedDesign:
+        """The design with model glasses, which glasses of the catalogs then replace one by one.
+
+        known: whether the glasses of the design are of catalogs; then it is returned where no time is left.
+        """
         first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
-        design = self.descend(Design(design.x, model, None), self.surfaces, self.cycles)
+        design = self.descend(Design(design.x, model), self.surfaces, self.cycles)
         self.steps.append(GlassStep("model", design.merit, self.seconds))
         waiting = list(self.surfaces)
         while waiting:
@@ -351,7 +369,7 @@ class Choice:
         return time.monotonic() - self.started
 
     def problem(self, glasses: dict[int, Glass], open_: Sequence[int]) -> Problem:
-        """With these glasses; the numbers of those of surfaces `open_` vary behind the other variables."""
+        """The problem with these glasses; numbers of the glasses of surfaces `open_` are the last variables."""
         numbers = tuple(Vary(k, name) for k in open_ for name in self.pool.names)
         follow = tuple(
             Solve(k, name, "pickup", source=source)
@@ -364,7 +382,7 @@ class Choice:
         )
         return Problem(model, self.rows, self.conditions, **self.options)
 
-    def limited(self, problem: Problem, open_: Sequence[int]):
+    def limited(self, problem: Problem, open_: Sequence[int]) -> Evaluate:
         """The states of a problem with the hull of the glasses as limits."""
         count, k = len(self.model.variables), self.pool.count
         slope = np.zeros((0, count + k * len(open_)))
@@ -374,11 +392,11 @@ class Choice:
             slope = np.vstack([slope, rows])
         reach = np.tile(self.pool.reach, len(open_))
 
-        def state(x: np.ndarray, derivatives: bool) -> State:
-            found = problem.state(x, derivatives)
-            limits = np.concatenate([found.limits, slope @ x - reach])
-            slopes = None if found.limits_slope is None else np.vstack([found.limits_slope, slope])
-            return dataclasses.replace(found, limits=limits, limits_slope=slopes)
+        def state(x: np.ndarray, derivatives: bool) -> SumOfSquares:
+            reached = problem.state(x, derivatives)
+            limits = np.concatenate([reached.limits, slope @ x - reach])
+            slopes = np.vstack([reached.limits_slope, slope]) if derivatives else reached.limits_slope
+            return dataclasses.replace(reached, limits=limits, limits_slope=slopes)
 
         return state
 
@@ -386,47 +404,49 @@ class Choice:
         numbers = [design.glasses[k].coefficients.numpy()[: self.pool.count] for k in open_]
         return np.concatenate([design.x, *numbers])
 
-    def descend(self, design: Design, open_: Sequence[int], cycles: int) -> Design:
+    def descend(self, design: Design, open_: Sequence[int], cycles: int) -> DescendedDesign:
         """The design at its minimum; glasses of surfaces `open_` are variable model glasses."""
         state = self.limited(self.problem(design.glasses, open_), open_)
         rest = np.full(self.pool.count * len(open_), np.inf)
         lower, upper = np.concatenate([self.bounds[0], -rest]), np.concatenate([self.bounds[1], rest])
         start = np.clip(self._start(design, open_), lower, upper)
-        found = least_squares(state, start, lower=lower, upper=upper, cycles=cycles, until=self.until)
-        if found.stopped == "interrupted":
+        descent = least_squares(state, start, lower=lower, upper=upper, cycles=cycles, until=self.until)
+        if descent.stopped == "interrupted":
             raise KeyboardInterrupt
-        self.evaluations += found.evaluations
-        self.descended += len(found.cycles)
+        self.evaluations += descent.evaluations
+        self.descended += len(descent.cycles)
         count, k = len(self.model.variables), self.pool.count
-        end = found.state.x
+        end = descent.state.x
         numbers = {s: end[count + k * j : count + k * (j + 1)] for j, s in enumerate(open_)}
-        glasses = design.glasses | {s: self.pool.model(one) for s, one in numbers.items()}
-        return Design(end[:count], glasses, found.state)
+        glasses = design.glasses | {s: self.pool.model(of_glass) for s, of_glass in numbers.items()}
+        return DescendedDesign(end[:count], glasses, descent.state)
 
     def predicted(self, design: Design, surfaces: Sequence[int], open_: Sequence[int]) -> dict[int, np.ndarray]:
-        """For surfaces the predicted merits (G,) of their candidates; glasses of `open_` follow too."""
+        """The predicted merits (G,) of the candidates of surfaces; the glasses of `open_` follow as well."""
         models = {k: self.pool.model(self.numbers(design, k)) for k in self.surfaces}
-        modelled = Design(design.x, models, None)
+        modelled = Design(design.x, models)
         x = self._start(modelled, self.surfaces)
         state = self.limited(self.problem(models, self.surfaces), self.surfaces)(x, True)
         count, k = len(self.model.variables), self.pool.count
         columns = {s: np.arange(count + k * j, count + k * (j + 1)) for j, s in enumerate(self.surfaces)}
         inside = np.arange(count)[(design.x > self.bounds[0]) & (design.x < self.bounds[1])]
         held = len(state.limits) - len(self.pool.normal) * len(self.surfaces)
-        at = state.limits_slope[:held][np.abs(state.limits[:held]) < _MET]
+        limits_met = state.limits_slope[:held][np.abs(state.limits[:held]) < _MET]
         merits = {}
         for s in surfaces:
             following = np.concatenate([inside, *(columns[o] for o in open_ if o != s)]).astype(int)
             change = self.candidates[s][1] - self.numbers(design, s)
-            merits[s] = expansion(state, columns[s], following, at).merit(change)
+            merits[s] = expansion(state, columns[s], following, limits_met).merit(change)
         return merits
 
     def numbers(self, design: Design, surface: int) -> np.ndarray:
         glass = design.glasses[surface]
         return self.pool.numbers_of(glass) if glass.catalog else glass.coefficients.numpy()[: self.pool.count]
 
-    def tried(self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]):
-        """(design, glass, predicted merit, all that were tried) of the best of the promising candidates."""
+    def tried(
+        self, design: Design, surface: int, merits: np.ndarray, open_: Sequence[int]
+    ) -> tuple[DescendedDesign, Glass, float, Trials] | None:
+        """Design, glass and predicted merit of the best of the promising candidates, and all that were tried."""
         (glasses, numbers), current = self.candidates[surface], design.glasses[surface]
         width = np.maximum(np.ptp(self.pool.numbers, axis=0), 1e-9)
         candidates: list[int] = []  # none like another
@@ -437,42 +457,48 @@ class Choice:
                 candidates.append(int(i))
             if len(candidates) == TRIED:
                 break
-        best, tried = None, []
+        best: tuple[DescendedDesign, Glass, float] | None = None
+        tried: list[tuple[str, float, float]] = []
         for i in candidates:
             if tried and time.monotonic() > self.until:
                 break
-            trial = Design(design.x, design.glasses | {surface: glasses[i]}, None)
+            trial = Design(design.x, design.glasses | {surface: glasses[i]})
             end = self.descend(trial, open_, min(TRIAL_CYCLES, self.cycles))
             tried.append((glasses[i].name, float(merits[i]), end.merit))
             if best is None or end.rank(charge(glasses[i])) < best[0].rank(charge(best[1])):
                 best = end, glasses[i], float(merits[i])
         return (*best, tuple(tried)) if best else None
 
-    def snap(self, design: Design, waiting: list[int]) -> Design:
-        """The design in which the element that loses most by it has taken a glass of the catalogs."""
+    def snap(self, design: Design, waiting: list[int]) -> DescendedDesign:
+        """The design with a glass of the catalogs in the element whose merit rises most by that."""
         merits = self.predicted(design, waiting, waiting)
         surface = max(waiting, key=lambda k: float(merits[k].min()))
         waiting.remove(surface)
-        end, glass, predicted, tried = self.tried(design, surface, merits[surface], waiting)
+        best = self.tried(design, surface, merits[surface], waiting)
+        assert best is not None  # a model glass is no candidate itself
+        end, glass, predicted, tried = best
         self._took("snap", surface, glass, "", predicted, end, tried)
         return end
 
     def swap(self, tested: Sequence[int] = ()) -> None:
-        """Exchange one glass at a time, the most promising first, until none helps; tested: where none has helped."""
-        tested = set(tested)
+        """Exchange one glass at a time, the most promising first, until no exchange lowers the merit.
+
+        tested: surfaces at which no exchange lowers it.
+        """
+        left_alone = set(tested)
         for _ in range(_ROUNDS * len(self.surfaces)):
-            left = [k for k in self.surfaces if k not in tested]
+            left = [k for k in self.surfaces if k not in left_alone]
             if not left or time.monotonic() > self.until:
                 return
             merits = self.predicted(self.best, left, ())
             surface = min(left, key=lambda k: float(merits[k].min()))
-            tested.add(surface)
+            left_alone.add(surface)
             if self._swap(surface, merits[surface]):
-                tested = {surface}
-            self._keep(tested)
+                left_alone = {surface}
+            self._keep(left_alone)
 
     def _swap(self, surface: int, merits: np.ndarray) -> bool:
-        """Exchange a glass, if that helps."""
+        """Exchange a glass, if that lowers the merit."""
         design, before = self.best, self.best.glasses[surface]
         best = self.tried(design, surface, merits, ())
         if best is None:
@@ -487,6 +513,15 @@ class Choice:
         self._took("swap", surface, glass, before.name, predicted, end, tried)
         return True
 
-    def _took(self, kind: str, surface: int, glass: Glass, replaced: str, predicted: float, design: Design, tried):
+    def _took(
+        self,
+        kind: str,
+        surface: int,
+        glass: Glass,
+        replaced: str,
+        predicted: float,
+        design: DescendedDesign,
+        tried: Trials,
+    ) -> None:
         taken = surface, glass.name, glass.catalog, replaced, predicted, tried
         self.steps.append(GlassStep(kind, design.merit, self.seconds, *taken))

@@ -1,4 +1,4 @@
-"""Solvers: damped least squares under bounds and conditions, several descents of it, and L-BFGS-B for other functions.
+"""Solvers: damped least squares under bounds and conditions, descents with several dampings, and L-BFGS-B.
 
 Each cycle of `least_squares` takes the exact Jacobian J of the residuals r, scales variables by its columns and tries
 the step of the damped linear model, bent by the second derivative along it (geodesic acceleration). The ratio of the
@@ -20,6 +20,7 @@ Source: Levenberg 1944, Marquardt 1963, Moré 1978 (scaling); Nielsen 1999 (damp
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import scipy.optimize
@@ -32,6 +33,9 @@ from raytrace.words import RaytraceError, RaytraceWarning
 _SHARED = 1e-5  # weight of the single sides of a row relative to their sum, which alone does not distinguish them
 _ROUNDS = 12  # in which inequalities that a step violates are added
 _SLACK = 1e-11  # of the scaled step: violation of a condition that is tolerated
+
+
+Arrays: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 class NoStep(RaytraceError, ValueError):
@@ -70,7 +74,18 @@ class Linear:
     lower, upper: (n,) of the step; limits (l,) ≤ 0 and their slope (l, n); scale: D (n,).
     """
 
-    def __init__(self, residuals, jacobian, *, sides: Sides, held, limits, lower, upper, scale):
+    def __init__(
+        self,
+        residuals: np.ndarray,
+        jacobian: np.ndarray,
+        *,
+        sides: Sides,
+        held: Arrays,
+        limits: Arrays,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        scale: np.ndarray,
+    ):
         self.scale = scale
         scaled = jacobian / scale
         if len(scaled) > len(scale):
@@ -97,17 +112,19 @@ class Linear:
         total = self.gradient + self.sides.slope.T @ pull
         _, free = _of_equalities(self.held[1], self.held[0])
         total = total - (total - free @ (free.T @ total))
-        at = self.least >= -_SLACK
-        if at.any():  # active inequalities carry the component that pushes against them
-            carried, _ = nnls(self.conditions[at].T, total)
-            total = total - self.conditions[at].T @ carried
+        active = self.least >= -_SLACK
+        if active.any():  # active inequalities carry the component that pushes against them
+            carried, _ = nnls(self.conditions[active].T, total)
+            total = total - self.conditions[active].T @ carried
         return float(np.abs(total).max(initial=0.0))
 
     def bend(self, second: np.ndarray, damping: float) -> np.ndarray:
         """-(JᵀJ + λ D²)⁻¹ of D⁻¹ Jᵀ r″, in the space that equalities and active bounds leave free."""
         _, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
-        at = self.least >= -_SLACK
-        _, free = _of_equalities(np.vstack([self.held[1], self.conditions[at]]), np.zeros(len(self.held[0]) + at.sum()))
+        active = self.least >= -_SLACK
+        _, free = _of_equalities(
+            np.vstack([self.held[1], self.conditions[active]]), np.zeros(len(self.held[0]) + active.sum())
+        )
         matrix = triangle @ free
         normal = matrix.T @ matrix
         return -(free @ np.linalg.lstsq(normal, free.T @ second, rcond=None)[0]) / self.scale
@@ -117,7 +134,7 @@ class Linear:
         return _of_equalities(self.held[1], held)[0] / self.scale
 
     def step(self, damping: float, share: float = 1.0) -> np.ndarray:
-        """The step (n,); share: the part of the violation of equalities and limits that it removes. Raises NoStep."""
+        """The step (n,); share: part of the violation of equalities and limits that the step removes. Raises NoStep."""
         basis, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
         target = -basis[: len(self.start)].T @ self.start
         base, free = _of_equalities(self.held[1], -share * self.held[0])
@@ -133,7 +150,16 @@ class Linear:
             active, switched = active | broken, switched | crossed
         return y / self.scale
 
-    def _under(self, triangle, target, base, free, active, least, switched) -> np.ndarray:
+    def _under(
+        self,
+        triangle: np.ndarray,
+        target: np.ndarray,
+        base: np.ndarray,
+        free: np.ndarray,
+        active: np.ndarray,
+        least: np.ndarray,
+        switched: np.ndarray,
+    ) -> np.ndarray:
         """The minimum of the damped model under the active conditions and sides."""
         matrix, right = triangle @ free, target - triangle @ base
         conditions, bound = self.conditions[active] @ free, (least - self.conditions @ base)[active]
@@ -165,7 +191,7 @@ class Linear:
         return base + free @ end[:width]
 
 
-def _of_equalities(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _of_equalities(matrix: np.ndarray, right: np.ndarray) -> Arrays:
     """The shortest step that meets equalities as well as possible, and a basis (n, f) of their null space."""
     count = matrix.shape[1]
     if not len(matrix):
@@ -221,10 +247,10 @@ _UNLIMITED = 500  # cycles of a path without other limits: along a narrow valley
 
 
 @dataclasses.dataclass(frozen=True)
-class State:
+class SumOfSquares:
     """A sum of squares and its conditions at x (n,): residuals (m,), sides, held (h,) = 0 and limits (l,) ≤ 0.
 
-    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, None unless requested.
+    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, empty unless requested.
     """
 
     x: np.ndarray
@@ -233,9 +259,9 @@ class State:
     sides: Sides
     held: np.ndarray
     limits: np.ndarray
-    jacobian: np.ndarray | None = None
-    held_slope: np.ndarray | None = None
-    limits_slope: np.ndarray | None = None
+    jacobian: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    held_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    limits_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def cost(self) -> float:
@@ -250,10 +276,12 @@ class State:
     def is_finite(self) -> bool:
         return bool(np.isfinite(self.cost) and np.isfinite(self.held).all() and np.isfinite(self.limits).all())
 
-    def is_better(self, other: "State") -> bool:
+    def is_better(self, other: "SumOfSquares") -> bool:
         """Fewer failed rays, then conditions met, then a lower merit."""
-        missed = [float(one.missed.max(initial=0.0)) for one in (self, other)]
-        ranks = [(one.lost, m if m > 1e-8 else 0.0, one.cost) for one, m in zip((self, other), missed, strict=True)]
+        missed = [float(state.missed.max(initial=0.0)) for state in (self, other)]
+        ranks = [
+            (state.lost, m if m > 1e-8 else 0.0, state.cost) for state, m in zip((self, other), missed, strict=True)
+        ]
         return ranks[0] < ranks[1]
 
 
@@ -272,7 +300,7 @@ class Cycle:
 
 
 @dataclasses.dataclass(frozen=True)
-class SolverState:
+class CycleStart:
     """All that determines the next cycle.
 
     x: the variables (n,); damping, and factor by which it is raised next; share: of violated conditions that a step
@@ -284,7 +312,7 @@ class SolverState:
     factor: float
     share: float
     price: float
-    scale: np.ndarray | None
+    scale: np.ndarray
     evaluations: int
     cycles: tuple[Cycle, ...]
 
@@ -293,19 +321,19 @@ class SolverState:
 class Descent:
     """The state in which a descent ended, and the reason."""
 
-    state: State
+    state: SumOfSquares
     stopped: str
     cycles: tuple[Cycle, ...]
     evaluations: int
 
 
-Evaluate = Callable[[np.ndarray, bool], State]
+Evaluate = Callable[[np.ndarray, bool], SumOfSquares]
 
 
 @dataclasses.dataclass(frozen=True)
 class SolverOptions:
     """damping: at the start; raised, lowered: factors, the latter the smallest; bends: with geodesic acceleration;
-    keeps: scales of variables never decrease. Each leads along its own path where there are several minima."""
+    keeps: scales of variables never decrease. Other options may lead to another minimum."""
 
     damping: float = 1e-3
     raised: float = 2.0
@@ -334,8 +362,8 @@ def least_squares(
     options: SolverOptions = SolverOptions(),
     cycles: int = 1000,
     until: float = np.inf,
-    watch: Callable[[Cycle, SolverState], None] | None = None,
-    resume: SolverState | None = None,
+    watch: Callable[[Cycle, CycleStart], None] | None = None,
+    resume: CycleStart | None = None,
 ) -> Descent:
     """Descend from x, which is within the bounds, for at most so many cycles, or until a time of `time.monotonic`.
 
@@ -352,16 +380,28 @@ class _OutOfTime(Exception):
 
 
 class _LeastSquares:
-    def __init__(self, evaluate, lower, upper, typical, options: SolverOptions, until: float, watch):
+    state: SumOfSquares
+
+    def __init__(
+        self,
+        evaluate: Evaluate,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        typical: np.ndarray,
+        options: SolverOptions,
+        until: float,
+        watch: Callable[[Cycle, CycleStart], None] | None,
+    ):
         self.evaluate, self.lower, self.upper, self.options = evaluate, lower, upper, options
         self.typical, self.until, self.watch = typical, until, watch
-        self.evaluations, self.cycles, self.started = 0, [], time.monotonic()
+        self.evaluations, self.started = 0, time.monotonic()
+        self.cycles: list[Cycle] = []
         self.damping, self.share, self.price = options.damping, 1.0, 0.0
-        self.scale = None
+        self.scale = np.zeros(len(lower))
         self.factor = 2.0
         self.seconds = {False: 0.0, True: 0.0}  # of the last evaluation without and with derivatives
 
-    def at(self, x: np.ndarray, derivatives: bool = False) -> State:
+    def at(self, x: np.ndarray, derivatives: bool = False) -> SumOfSquares:
         """The state at x. Raises _OutOfTime."""
         started = time.monotonic()
         if started + self.seconds[derivatives] > self.until:
@@ -371,7 +411,7 @@ class _LeastSquares:
         self.seconds[derivatives] = time.monotonic() - started
         return state
 
-    def descend(self, x: np.ndarray, cycles: int, resume: SolverState | None) -> Descent:
+    def descend(self, x: np.ndarray, cycles: int, resume: CycleStart | None) -> Descent:
         if resume is not None:
             self.damping, self.factor, self.share = resume.damping, resume.factor, resume.share
             self.price, self.scale = resume.price, resume.scale
@@ -394,20 +434,19 @@ class _LeastSquares:
         return Descent(self.state, stopped, tuple(self.cycles), self.evaluations)
 
     def _cycle(self, number: int) -> str:
-        """One accepted step; the reason where none follows. Raises _OutOfTime."""
+        """Take one accepted step; the reason to stop, "" to continue. Raises _OutOfTime."""
         linear = self._linear()
         if self._is_flat(linear):
             return "gradient"
         for _ in range(_TRIES):
-            trial, step, predicted = self._try(linear)
-            if (
-                step is not None
-                and self.damping < 1
-                and predicted <= _ROUNDING * self.state.cost
-                and not (self.state.missed > 1e-9).any()
-            ):
+            is_missed = bool((self.state.missed > 1e-9).any())
+            if (tried := self._try(linear)) is None:
+                self._raise_damping(True)
+                continue
+            trial, step, predicted = tried
+            if self.damping < 1 and predicted <= _ROUNDING * self.state.cost and not is_missed:
                 return "gradient"
-            if trial is not None and self._accepts(trial, predicted):
+            if self._accepts(trial, predicted):
                 try:
                     self.state = self.at(trial.x, True)
                 except _OutOfTime:
@@ -416,14 +455,14 @@ class _LeastSquares:
                     return "seconds"
                 self._report(number, step)
                 return self._idle()
-            self.damping, self.factor = self.damping * self.factor, 2 * self.factor
-            if step is None or (self.state.missed > 1e-9).any():
-                self.share *= 0.5
-            if step is None:
-                continue
+            self._raise_damping(is_missed)
             if np.linalg.norm(self.scale * step) <= _STILL * (np.linalg.norm(self.scale * self.state.x) + 1e-300):
                 return "step"
         return "step"
+
+    def _raise_damping(self, halves_share: bool) -> None:
+        self.damping, self.factor = self.damping * self.factor, 2 * self.factor
+        self.share *= 0.5 if halves_share else 1.0
 
     def _linear(self) -> Linear:
         state = self.state
@@ -431,19 +470,19 @@ class _LeastSquares:
         floor = self.options.floor * np.sqrt(self.state.cost) / self.typical
         columns = np.sqrt(columns**2 + floor**2)
         columns = np.where(columns > 0, columns, 1.0)
-        self.scale = np.maximum(columns, self.scale) if self.options.keeps and self.scale is not None else columns
+        self.scale = np.maximum(columns, self.scale) if self.options.keeps else columns
         return Linear(
             state.residuals, state.jacobian, sides=state.sides, held=(state.held, state.held_slope),
             limits=(state.limits, state.limits_slope), lower=self.lower - state.x, upper=self.upper - state.x,
             scale=self.scale,
         )  # fmt: skip
 
-    def _try(self, linear: Linear):
+    def _try(self, linear: Linear) -> tuple[SumOfSquares, np.ndarray, float] | None:
         """The state of a trial step, the step, and the predicted reduction; None where there is no step."""
         try:
             step = linear.step(self.damping, self.share)
         except NoStep:
-            return None, None, 0.0
+            return None
         bent = self._bent(linear, step) if self.options.bends else step
         trial = self.at(np.clip(self.state.x + bent, self.lower, self.upper))
         if len(self.state.held) and trial.is_finite:
@@ -463,8 +502,8 @@ class _LeastSquares:
             return step
         return step + bend
 
-    def _restored(self, linear: Linear, trial: State) -> State:
-        """Nonlinear equalities met again after the step."""
+    def _restored(self, linear: Linear, trial: SumOfSquares) -> SumOfSquares:
+        """The trial with nonlinear equalities met again after the step."""
         for _ in range(2):
             if np.abs(trial.held).max() <= _MET * max(np.abs(self.state.held).max(), 1e-3):
                 break
@@ -475,7 +514,7 @@ class _LeastSquares:
             trial = again
         return trial
 
-    def _accepts(self, trial: State, predicted: float) -> bool:
+    def _accepts(self, trial: SumOfSquares, predicted: float) -> bool:
         """Whether a trial is accepted; sets the damping by the ratio of achieved to predicted reduction."""
         state = self.state
         if not trial.is_finite or trial.lost > state.lost:
@@ -521,7 +560,7 @@ class _LeastSquares:
         if self.watch is not None:
             self.watch(
                 cycle,
-                SolverState(
+                CycleStart(
                     state.x, self.damping, self.factor, self.share, self.price, self.scale, self.evaluations,
                     tuple(self.cycles),
                 ),
@@ -535,7 +574,7 @@ class _LeastSquares:
 class BestDescent:
     """The best state, the cycles of all paths, and why the path of the best one ended."""
 
-    state: State
+    state: SumOfSquares
     history: tuple[Cycle, ...]
     stopped: str
     cycles: int
@@ -543,13 +582,13 @@ class BestDescent:
 
 
 @dataclasses.dataclass(frozen=True)
-class PathState:
-    """State of several paths: number of the current path, from 0, its start and solver state; cycles and evaluations
-    before it; and the best end (x, reason) of those before it, None for the first."""
+class PathProgress:
+    """Progress of descents along several paths: number of the current path, from 0, its start, and where its next cycle
+    starts; cycles and evaluations of the paths before it, and their best end (x, reason), None for the first path."""
 
     path: int
     start: np.ndarray
-    solver: SolverState | None
+    solver: CycleStart
     before: tuple[Cycle, ...] = ()
     evaluations: int = 0
     best: tuple[np.ndarray, str] | None = None
@@ -557,15 +596,19 @@ class PathState:
     @property
     def history(self) -> tuple[Cycle, ...]:
         """The cycles of all paths."""
-        return (*self.before, *self.counted(self.solver.cycles))
+        return (*self.before, *_counted(self.solver.cycles, len(self.before), self.evaluations))
 
-    def counted(self, cycles: Sequence[Cycle]) -> list[Cycle]:
-        """Cycles of this path by their number in all paths."""
-        number, evaluations = len(self.before), self.evaluations
-        return [
-            dataclasses.replace(one, number=one.number + number, evaluations=one.evaluations + evaluations)
-            for one in cycles
-        ]
+
+def _counted(cycles: Sequence[Cycle], before: int, evaluations: int) -> list[Cycle]:
+    """Cycles of a path by their number in all paths; before, evaluations: cycles and evaluations of earlier paths."""
+    return [
+        dataclasses.replace(cycle, number=cycle.number + before, evaluations=cycle.evaluations + evaluations)
+        for cycle in cycles
+    ]
+
+
+#: Cycles, evaluations and the best end of earlier paths, as of `PathProgress`.
+_Earlier: TypeAlias = tuple[tuple[Cycle, ...], int, tuple[np.ndarray, str] | None]
 
 
 def best_of_paths(
@@ -578,38 +621,47 @@ def best_of_paths(
     paths: int = 1,
     cycles: int | None = None,
     seconds: float | None = None,
-    watch: Callable[[Cycle, PathState], None] | None = None,
-    resume: PathState | None = None,
+    watch: Callable[[Cycle, PathProgress], None] | None = None,
+    resume: PathProgress | None = None,
 ) -> BestDescent:
     """Descend from x within the bounds with the options of so many PATHS; cycles and seconds: of all of them together,
-    without either 500 cycles each.
+    by default 500 cycles each.
 
     watch: invoked after each cycle; resume: state of earlier paths: cycles count from their start.
     """
     until = time.monotonic() + (np.inf if seconds is None else seconds)
     most = cycles if cycles is not None else _UNLIMITED * max(1, paths) if seconds is None else 1_000_000
-    first = PathState(0, x, None) if resume is None else resume
-    x, best, stopped = first.start, None, ""
-    if first.best is not None:
-        best, stopped = evaluate(first.best[0], False), first.best[1]
-    history, evaluations = first.before, first.evaluations
-    for path in range(first.path, min(len(PATHS), max(1, paths))):
-        current = PathState(path, x, first.solver, history, evaluations, None if best is None else (best.x, stopped))
+    first, evaluations = 0, 0
+    solver: CycleStart | None = None
+    history: tuple[Cycle, ...] = ()
+    best: SumOfSquares | None = None
+    stopped = ""
+    if resume is not None:
+        first, x, solver, history, evaluations = (
+            resume.path, resume.start, resume.solver, resume.before, resume.evaluations,
+        )  # fmt: skip
+        if resume.best is not None:
+            best, stopped = evaluate(resume.best[0], False), resume.best[1]
+    for path in range(first, min(len(PATHS), max(1, paths))):
+        earlier = history, evaluations, None if best is None else (best.x, stopped)
 
-        def each(cycle: Cycle, solver: SolverState, current=current) -> None:
-            watch(*current.counted([cycle]), dataclasses.replace(current, solver=solver))
+        def each(cycle: Cycle, solver: CycleStart, path: int = path, earlier: _Earlier = earlier) -> None:
+            if watch is not None:
+                progress = PathProgress(path, x, solver, *earlier)
+                watch(_counted([cycle], len(progress.before), progress.evaluations)[0], progress)
 
         descent = least_squares(
             evaluate, x, lower=lower, upper=upper, typical=typical, options=PATHS[path], cycles=most - len(history),
-            until=until, watch=watch and each, resume=first.solver if path == first.path else None,
+            until=until, watch=each, resume=solver if path == first else None,
         )  # fmt: skip
-        history = (*history, *current.counted(descent.cycles))
+        history = (*history, *_counted(descent.cycles, len(history), evaluations))
         evaluations += descent.evaluations
         if best is None or descent.state.is_better(best):
             best, stopped = descent.state, descent.stopped
         if descent.stopped in ("interrupted", "seconds") or len(history) >= most or time.monotonic() > until:
             stopped = descent.stopped if descent.stopped in ("interrupted", "cycles", "seconds") else stopped
             break
+    assert best is not None  # there is a path
     return BestDescent(best, history, stopped, len(history), evaluations)
 
 
@@ -620,14 +672,32 @@ _STEPS = 15_000
 
 
 class NoOptimum(RaytraceWarning):
-    """A search ended where the error still falls; its last point is used."""
+    """A descent ended where the error still falls; its last point is used."""
 
 
-def _lbfgsb(function, x, scale, bounds, **options):
+Slope: TypeAlias = tuple[float, np.ndarray]  # a value and its gradient
+
+
+class Function(Protocol):
+    """A function of variables (n,): its value and its gradient (n,); evaluations: how often it was called."""
+
+    evaluations: int
+
+    def __call__(self, x: np.ndarray, /) -> Slope: ...
+
+
+def _lbfgsb(
+    function: Callable[[np.ndarray], Slope],
+    x: np.ndarray,
+    scale: np.ndarray | float,
+    bounds: np.ndarray | None,
+    *,
+    callback: Callable[[np.ndarray], None] | None = None,
+    **options: float,
+) -> Any:
     """scipy's L-BFGS-B on y = x / scale. function: x -> (value, gradient); bounds: (n, 2) of x, or None."""
-    callback = options.pop("callback", None)
 
-    def scaled(y: np.ndarray) -> tuple[float, np.ndarray]:
+    def scaled(y: np.ndarray) -> Slope:
         value, gradient = function(y * scale)
         return value, gradient * scale
 
@@ -639,7 +709,7 @@ def _lbfgsb(function, x, scale, bounds, **options):
 
 
 def minimise(
-    merit: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    merit: Function,
     x: np.ndarray,
     *,
     lower: np.ndarray,
@@ -651,30 +721,32 @@ def minimise(
 ) -> tuple[np.ndarray, str, list[Cycle]]:
     """Variables at a minimum of a merit that is not a sum of squares, why the descent ended, and its cycles.
 
-    merit: x -> value and gradient, with a count `evaluations`; typical: as for `least_squares`.
+    typical: as for `least_squares`.
     """
-    started, reports = time.monotonic(), []
+    started = time.monotonic()
+    reports: list[Cycle] = []
     scale = np.where(np.isfinite(typical), typical, np.maximum(np.abs(x), 1e-3))
     start = merit(x)[0]
-    best, last = [start, x], [0.0]  # last: s of an evaluation
+    least, best, last = start, x, 0.0  # last: s of an evaluation
 
-    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost(x: np.ndarray) -> Slope:
+        nonlocal least, best, last
         evaluated = time.monotonic()
-        if seconds is not None and evaluated + last[0] > started + seconds:
+        if seconds is not None and evaluated + last > started + seconds:
             raise _OutOfTime
         value, gradient = merit(x)
-        last[0] = time.monotonic() - evaluated
+        last = time.monotonic() - evaluated
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return _FAR * max(abs(start), 1.0), np.zeros_like(x)
-        if value < best[0]:
-            best[:] = value, x
+        if value < least:
+            least, best = value, x
         return value, gradient
 
     def each(y: np.ndarray) -> None:
         elapsed = time.monotonic() - started
-        reports.append(Cycle(len(reports) + 1, best[0], 0.0, 0.0, 0.0, merit.evaluations, elapsed))
+        reports.append(Cycle(len(reports) + 1, least, 0.0, 0.0, 0.0, merit.evaluations, elapsed))
         if watch is not None:
-            watch(reports[-1], best[1])
+            watch(reports[-1], best)
         if seconds is not None and elapsed > seconds:
             raise _OutOfTime
 
@@ -688,7 +760,7 @@ def minimise(
         stopped = "seconds"
     except KeyboardInterrupt:
         stopped = "interrupted"
-    return best[1], stopped, reports
+    return best, stopped, reports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -715,7 +787,9 @@ def minimise_tensors(
     unit: of the parameters, length of the first step; bounds: (lowest, highest) of each number; tolerance: relative
     change of the function below which it ends.
     """
-    shapes, values, gradients = [p.shape for p in parameters], [], []
+    shapes = [p.shape for p in parameters]
+    values: list[float] = []
+    gradients: list[np.ndarray] = []
     ends = np.cumsum([shape.numel() for shape in shapes])[:-1]
 
     def put(x: np.ndarray) -> None:
@@ -726,7 +800,7 @@ def minimise_tensors(
     def flat(tensors: Sequence[Tensor]) -> np.ndarray:
         return torch.cat([t.detach().flatten() for t in tensors]).double().numpy()
 
-    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def evaluate(x: np.ndarray) -> Slope:
         put(x)
         value = function()
         values.append(float(value.detach()))

@@ -18,15 +18,15 @@ of the stop: by Newton's method from the last solution, and ∂a/∂x = (∂s/�
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, Vector, dot, is_any, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
 from raytrace.system.configurations import Operand, ScaledPath, with_entry
 from raytrace.system.lens import Lens, index_behind, is_round_about_axis, media, per_lens
@@ -50,7 +50,7 @@ from raytrace.system.parameter_paths import (
 from raytrace.system.phases import power_of
 from raytrace.system.rays import Rays
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import is_flat, medium_surfaces, power, sag_at, signed, vertex_curvature
+from raytrace.system.surface import Surface, is_flat, medium_surfaces, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of, structure_of
 from raytrace.tracing.geometry import edge_thickness, semi_diameter
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
@@ -66,6 +66,13 @@ from raytrace.tracing.trace import (
     trace_surfaces,
     without_apertures,
 )
+
+Kept = TypeVar("Kept")
+Pair: TypeAlias = tuple[Number, Number]
+#: Position and direction, three arrays or dual numbers (W, R) each, path and validity (W, R).
+Launch: TypeAlias = tuple[Sequence[Number], Sequence[Number], Number, np.ndarray]
+#: Columns of a table of numbers by the address of the number, or by the surface before a medium.
+Columns: TypeAlias = dict[Address | int, np.ndarray]
 
 # -- the lens as a function of its variables ---------------------------------------------------------------------------
 
@@ -84,16 +91,19 @@ class DesignVariables:
     solves: tuple[Solve, ...] = ()
     opening: float = 1.0
 
-    def __post_init__(self):
-        for one in (*self.variables, *self.solves):
-            if not 0 <= one.surface < len(self.lens.surfaces):
+    def __post_init__(self) -> None:
+        numbers: tuple[Vary | Solve, ...] = (*self.variables, *self.solves)
+        for number in numbers:
+            if not 0 <= number.surface < len(self.lens.surfaces):
                 last = len(self.lens.surfaces) - 1
-                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
-        named = {
-            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
-            for one in self.variables
+                raise UnknownNumber(
+                    f"{number.quantity} of surface {number.surface}: this lens has surfaces 0 to {last}"
+                )
+        moved: set[tuple] = {
+            variable.address if variable.operand is None else (variable.operand, variable.configuration, "operand")
+            for variable in self.variables
         }
-        if len(named) < len(self.variables):
+        if len(moved) < len(self.variables):
             raise UnknownNumber("a variable is named twice")
         object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
 
@@ -107,15 +117,15 @@ class DesignVariables:
         """The current variables (n,)."""
         return np.array(
             [
-                stored_or_0(self.lens, (one.surface, one.quantity))
-                if one.operand is None
-                else float(self.lens.operands[one.operand].numbers[one.configuration - 1])
-                for one in self.variables
+                stored_or_0(self.lens, variable.address)
+                if variable.operand is None
+                else float(_numbers_of(self.lens.operands[variable.operand])[variable.configuration - 1])
+                for variable in self.variables
             ]
         )
 
     def lens_at(self, variables: Tensor | np.ndarray, lens: Lens | None = None) -> Lens:
-        """The lens at variables (n,), or L lenses at (L, n), with all that follows from the variables.
+        """The lens at variables (n,), or L lenses at (L, n), with solves and pickups.
 
         lens: the same lens in the dtype and on the device of the variables, if they differ.
 
@@ -128,113 +138,123 @@ class DesignVariables:
         each, operands = tuple(map(per_lens, variables.unbind(-1))), list(lens.operands)
         for configuration in range(1, len(lens.configurations) + 1) if operands else ():
             for k, (variable, scale, offset) in followed(self, configuration).items():
-                numbers = with_entry(operands[k].numbers, (configuration - 1,), scale * each[variable] + offset)
-                operands[k] = dataclasses.replace(operands[k], numbers=numbers)
+                number = scale * each[variable] + offset
+                changed = with_entry(_numbers_of(operands[k]), (configuration - 1,), number)
+                operands[k] = dataclasses.replace(operands[k], numbers=changed)
         view = self.views[lens.current_configuration - 1]
         lens = dataclasses.replace(lens, operands=tuple(operands))
         numbers = LensState(view, each, lens).tensors() if view.solves else view.numbers(each)
         return with_numbers_of(lens, numbers, view.places)
 
 
+def _numbers_of(operand: Operand) -> Tensor:
+    """The numbers (C,) of an operand that varies."""
+    assert operand.numbers is not None
+    return operand.numbers
+
+
 def _with_picked_glasses(lens: Lens, variables: Sequence[Vary], solves: Sequence[Solve]) -> Lens:
     """The lens whose pickups of glasses that vary have the glass that they pick up."""
-    moved, surfaces = {one.surface for one in variables if one.quantity in GLASS}, list(lens.surfaces)
-    pickups = [one for one in solves if (one.quantity, one.kind) == ("glass", "pickup")]
-    for one in sorted(pickups, key=lambda one: one.surface):
-        if one.source in moved:
-            glass = surfaces[one.source].glass
-            surfaces[one.surface] = dataclasses.replace(surfaces[one.surface], glass=glass)
-            moved.add(one.surface)
+    moved, surfaces = {variable.surface for variable in variables if variable.quantity in GLASS}, list(lens.surfaces)
+    pickups = [solve for solve in solves if (solve.quantity, solve.kind) == ("glass", "pickup")]
+    for pickup in sorted(pickups, key=lambda pickup: pickup.surface):
+        if pickup.source in moved:
+            glass = surfaces[pickup.source].glass
+            surfaces[pickup.surface] = dataclasses.replace(surfaces[pickup.surface], glass=glass)
+            moved.add(pickup.surface)
     return dataclasses.replace(lens, surfaces=tuple(surfaces)) if pickups else lens
 
 
 # -- a lens in one configuration ---------------------------------------------------------------------------------------
 
-#: Power of length of what a pickup between configurations adds.
+#: Power of length of the offset of a pickup between configurations.
 _POWERS = {"thickness": 1, "curvature": -1}
 
 
 class View:
-    """A lens in one configuration: what of it moves, and what stays."""
+    """A lens in one configuration: its numbers that move, and data that stay the same."""
 
-    def __init__(self, model: DesignVariables, configuration: int, *, clips: bool = False):
-        """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
+    def __init__(self, model: DesignVariables, configuration: int, *, clips: bool = False) -> None:
+        """clips: whether apertures clip rays; the rays of a merit function pass all apertures."""
         self.model, self.configuration = model, configuration
         lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
         if not clips:
             surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in lens.surfaces)
             lens = dataclasses.replace(lens, surfaces=surfaces)
-        #: Numbers that operands of the configurations set: there the surface's own variable or solve is void.
+        #: Numbers that operands of the configurations set: they override variables and solves of the surface.
         operands = (operand for operand in lens.operands if operand.numbers is not None)
-        overridden = {at for operand in operands for at, _ in addresses_of(lens, operand)}
+        overridden = {address for operand in operands for address, _ in addresses_of(lens, operand)}
         #: By address: the variable that a number follows, its factor and its offset.
         self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
-        for number, one in enumerate(model.variables):
-            if one.operand is None and (one.surface, one.quantity) not in overridden:
-                self.variables[one.surface, one.quantity] = number, 1.0, 0.0
-        own = [one for one in model.solves if one.operand is None and (one.surface, one.quantity) not in overridden]
-        own = [one for one in own if one.quantity == "glass" or not self._is_idle(one, lens)]
-        own = _with_glasses(own, self.variables)
-        self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
-        moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
+        for number, variable in enumerate(model.variables):
+            if variable.operand is None and variable.address not in overridden:
+                self.variables[variable.address] = number, 1.0, 0.0
+        solves = [solve for solve in model.solves if solve.operand is None and solve.address not in overridden]
+        solves = [solve for solve in solves if solve.quantity == "glass" or not self._is_idle(solve, lens)]
+        solves = _with_glasses(solves, self.variables)
+        self.solves = sorted(solves, key=lambda solve: (solve.surface, solve.quantity == "thickness"))
+        moved = (*self.variables, *(solve.address for solve in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
-        surfaces = list(lens.surfaces)
+        changed = list(lens.surfaces)
         for surface, quantity in self.moved:
-            surfaces[surface] = modelled(surfaces[surface], quantity)
-        self.lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
-        self.stored = {at: self.number(at) for at in self.moved}
-        surfaces = self.lens.surfaces
+            changed[surface] = modelled(changed[surface], quantity)
+        self.lens = dataclasses.replace(lens, surfaces=tuple(changed))
+        self.stored = {address: self.number(address) for address in self.moved}
         #: Where the lens holds the numbers that move.
-        self.places = {at: path_of(surfaces[at[0]], at[1]) for at in self.moved if at not in OF_LENS}
+        self.places = {
+            (k, quantity): path_of(self.lens.surfaces[k], quantity)
+            for k, quantity in self.moved
+            if (k, quantity) not in OF_LENS
+        }
 
-    def _is_idle(self, one: Solve, lens: Lens) -> bool:
-        """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
-        at = [(one.source, one.quantity_of_source or one.quantity), (one.surface, one.quantity)]
-        known = all(quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in at)
-        return one.kind == "pickup" and not known and at[0] not in self.variables
+    def _is_idle(self, solve: Solve, lens: Lens) -> bool:
+        """Whether a pickup follows a number that does not vary and is 0, because the lens does not model it."""
+        addresses = [solve.address_of_source, solve.address]
+        known = all(
+            quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in addresses
+        )
+        return solve.kind == "pickup" and not known and addresses[0] not in self.variables
 
     @cached_property
     def clipping(self) -> "View":
-        """The same with its apertures."""
+        """The view with its apertures."""
         return View(self.model, self.configuration, clips=True)
 
     @cached_property
     def waits(self) -> bool:
-        """Whether a solve waits for others that come later, or for the entrance pupil that it moves itself."""
-        solved = {(one.surface, one.quantity): position for position, one in enumerate(self.solves)}
+        """Whether a solve depends on later solves, or on the entrance pupil, which it moves itself."""
+        solved = {solve.address: position for position, solve in enumerate(self.solves)}
 
-        def is_late(position: int, one: Solve) -> bool:
-            if one.kind == "pickup":
-                return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
-            if one.kind in ("power", "position"):
-                return one.source > one.surface
+        def is_late(position: int, solve: Solve) -> bool:
+            if solve.kind == "pickup":
+                return solved.get(solve.address_of_source, -1) >= position
+            if solve.kind in ("power", "position"):
+                return solve.source > solve.surface
             last = sensor(self.lens), "thickness"  # which changes no power
-            if one.kind == "focal_length":
-                return any((later.surface, later.quantity) != last for later in self.solves[position + 1 :])
-            if (one.surface, one.quantity) == last:
+            if solve.kind == "focal_length":
+                return any(later.address != last for later in self.solves[position + 1 :])
+            if solve.address == last:
                 return False
-            if one.kind == "edge_thickness":
-                shape = [
-                    at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
-                ]
-                return bool(shape) or not any(one.numbers[1:])
-            return one.surface < self.lens.stop or self.lens.aperture.kind in (
+            if solve.kind == "edge_thickness":
+                shapes = any(quantity != "thickness" and surface > solve.surface for surface, quantity in solved)
+                return shapes or not any(solve.numbers[1:])
+            return solve.surface < self.lens.stop or self.lens.aperture.kind in (
                 "image_f_number",
                 "paraxial_working_f_number",
             )
 
-        return any(is_late(*found) for found in enumerate(self.solves))
+        return any(map(is_late, range(len(self.solves)), self.solves))
 
-    def numbers(self, variables) -> dict[Address, object]:
+    def numbers(self, variables: Number) -> dict[Address, Number]:
         """The numbers that variables move, without those that are solved."""
         return {
-            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
-            for at, (number, scale, offset) in self.variables.items()
+            address: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
+            for address, (number, scale, offset) in self.variables.items()
         }
 
-    def number(self, at: Address) -> float:
+    def number(self, address: Address) -> float:
         """A number of the lens as it is stored."""
-        return stored_or_0(self.lens, at)
+        return stored_or_0(self.lens, address)
 
     @cached_property
     def wavelengths(self) -> list[float]:
@@ -253,13 +273,13 @@ class View:
 
     @cached_property
     def glasses(self) -> dict[int, list[Address]]:
-        """What moves of the media, by the surface in front of them: all of them with the air."""
-        air = [at for at in (TEMPERATURE, PRESSURE) if at in self.moved]
-        found: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
+        """Addresses of the numbers that change each medium, by the surface in front of it."""
+        air = [address for address in (TEMPERATURE, PRESSURE) if address in self.moved]
+        moving: dict[int, list[Address]] = {k: [*air] for k in self.media if air}
         for surface, quantity in self.moved:
             if quantity in GLASS or quantity.startswith(GLASS_NUMBER):
-                found.setdefault(surface, []).append((surface, quantity))
-        return found
+                moving.setdefault(surface, []).append((surface, quantity))
+        return moving
 
     @cached_property
     def thickness(self) -> list[float]:
@@ -296,27 +316,31 @@ class View:
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """Whether all of it is round about one axis."""
+        """Whether the lens is symmetric about its axis."""
         return is_round_about_axis(self.lens)
 
     @cached_property
     def is_plain(self) -> bool:
         """Whether all first-order data follow from thicknesses and curvatures alone."""
         plain = "curvature", "thickness", *GLASS
-        others = [at for at in self.stored if at[1] not in plain and not at[1].startswith(GLASS_NUMBER)]
+        others = [
+            address for address in self.stored if address[1] not in plain and not address[1].startswith(GLASS_NUMBER)
+        ]
         units = torch.eye(len(others), dtype=torch.float64)
-        numbers = {at: torch.tensor(float(self.stored[at]), dtype=torch.float64) for at in others}
+        numbers = {address: torch.tensor(float(self.stored[address]), dtype=torch.float64) for address in others}
         with torch.enable_grad():
-            lens = self.held({at: with_tangents(numbers[at], units[k]) for k, at in enumerate(others)})
+            lens = self.held({address: with_tangents(numbers[address], units[k]) for k, address in enumerate(others)})
             powers = [vertex_curvature(s) for s in lens.surfaces if s.curvature is not None or s.is_plane]
             powers += [power_of(s.phase, lens.wavelengths)[1] for s in lens.surfaces if s.phase is not None]
         return not any(bool(tangents_of(power, len(others)).any()) for power in powers)
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
-        """The lens with other numbers."""
+        """The lens with these numbers instead of its own."""
         return with_numbers_of(self.lens, numbers, self.places)
 
-    def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
+    def table_of(
+        self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None
+    ) -> tuple[Sequence[Surface], Any, Tensor]:
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
 
         indices: (W,) of media by the surface in front of each, instead of the indices of the lens.
@@ -324,84 +348,86 @@ class View:
         wavelength = lens.wavelengths[:, None]
         surfaces = sequence_of(lens)[:last]
         given = indices or {}
-        indices = [
+        behind = [
             given[surface][:, None] if surface in given else n
             for surface, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
         ]
-        structure, table = structure_of(surfaces, indices, 1, None, wavelength)
+        structure, table = structure_of(surfaces, behind, 1, None, wavelength)
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
         return surfaces, structure, torch.stack(rows, -1)
 
-    def state(self, variables) -> "LensState":
+    def state(self, variables: Number) -> "LensState":
         return LensState(self, variables)
 
 
-def stored_or_0(lens: Lens, at: Address) -> float:
+def stored_or_0(lens: Lens, address: Address) -> float:
     """A number of a lens as it is stored, 0 where it is not modelled."""
-    number = stored_number(lens, at)
+    number = stored_number(lens, address)
     return 0.0 if number is None else float(number)
 
 
 def _of_operands(model: DesignVariables, configuration: int) -> dict[Address, tuple[int, float, float]]:
-    """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
-    operands that pick up the number of another configuration."""
+    """Variable, factor and offset of the numbers of surfaces that operands move in a configuration, by address."""
     return {
-        at: (number, place.factor * scale, place.factor * offset + place.offset)
+        address: (number, place.factor * scale, place.factor * offset + place.offset)
         for operand, (number, scale, offset) in followed(model, configuration).items()
-        for at, place in addresses_of(model.lens, model.lens.operands[operand])
+        for address, place in addresses_of(model.lens, model.lens.operands[operand])
     }
 
 
 def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int, float, float]]:
-    """By operand that moves in a configuration: the variable that moves it, its factor and its offset.
+    """The variable, factor and offset of each operand that moves in a configuration.
 
-    A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
+    A pickup of another configuration is scale · (number there) + offset; the number there may be a pickup itself.
     """
-    moved = {
-        (one.operand, one.configuration): (number, 1.0, 0.0)
-        for number, one in enumerate(model.variables)
-        if one.operand is not None
+    moved: dict[tuple[int | None, int], tuple[int, float, float]] = {
+        (variable.operand, variable.configuration): (number, 1.0, 0.0)
+        for number, variable in enumerate(model.variables)
+        if variable.operand is not None
     }
-    pickups = [one for one in model.solves if one.operand is not None and one.kind == "pickup" and one.numbers]
+    pickups = [
+        solve for solve in model.solves if solve.operand is not None and solve.kind == "pickup" and solve.numbers
+    ]
     for _ in pickups:
-        for one in pickups:
-            source, at = (int(one.numbers[0]), one.source), (one.operand, one.configuration)
-            if source in moved and at not in moved:
+        for pickup in pickups:
+            source, place = (int(pickup.numbers[0]), pickup.source), (pickup.operand, pickup.configuration)
+            if source in moved and place not in moved:
                 number, scale, offset = moved[source]
                 added = (
-                    one.offset * model.lens.optimization_data.unit ** _POWERS.get(one.quantity, 0)
+                    pickup.offset * model.lens.optimization_data.unit ** _POWERS.get(pickup.quantity, 0)
                     if model.lens.optimization_data
                     else 0.0
                 )
-                moved[at] = number, one.scale * scale, one.scale * offset + added
-    return {operand: linear for (operand, at), linear in moved.items() if at == configuration}
+                moved[place] = number, pickup.scale * scale, pickup.scale * offset + added
+    here = {operand: linear for (operand, number), linear in moved.items() if number == configuration}
+    return {operand: linear for operand, linear in here.items() if operand is not None}
 
 
-def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
-    """Pickups of glasses as pickups of each number that varies of the glass that is picked up."""
-    moved, found = set(variables), []
-    for one in sorted(solves, key=lambda one: one.surface):
-        if one.quantity != "glass":
-            found.append(one)
+def _with_glasses(solves: Sequence[Solve], variables: Iterable[Address]) -> list[Solve]:
+    """The solves, with each pickup of a glass replaced by pickups of the numbers of that glass that vary."""
+    moved, expanded = set(variables), []
+    for solve in sorted(solves, key=lambda solve: solve.surface):
+        if solve.quantity != "glass":
+            expanded.append(solve)
             continue
-        names = [name for name in GLASS if (one.source, name) in moved]
-        moved |= {(one.surface, name) for name in names}
-        found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
-    return found
+        names = [name for name in GLASS if (solve.source, name) in moved]
+        moved |= {(solve.surface, name) for name in names}
+        expanded += [Solve(solve.surface, name, "pickup", source=solve.source) for name in names]
+    return expanded
 
 
 def addresses_of(lens: Lens, operand: Operand) -> Iterator[tuple[Address, ScaledPath]]:
     """The numbers of surfaces that an operand of the configurations sets, each with its place."""
     for place in operand.paths:
         if place.path[0] == "surfaces":
-            surface = place.path[1]
+            surface = cast(int, place.path[1])
             yield from (((surface, name), place) for name in names_at(lens.surfaces[surface], place.path[2:]))
 
 
 # -- solves and pickups ------------------------------------------------------------------------------------------------
 
 
-def _marginal_ray_before(state, surface: int):
+def _marginal_ray_before(state: "LensState", surface: int) -> tuple[Number, Number]:
     """(y, ω) of the paraxial marginal ray in front of a surface."""
     y, omega = state.marginal_height, state.marginal_height * state.vergence
     if surface == 1:
@@ -410,26 +436,26 @@ def _marginal_ray_before(state, surface: int):
     return A * y + B * omega, C * y + D * omega
 
 
-def _pickup(state, solve: Solve):
-    return solve.scale * state.number(solve.source, solve.quantity_of_source or solve.quantity) + solve.offset
+def _pickup(state: "LensState", solve: Solve) -> Number:
+    return solve.scale * state.number(*solve.address_of_source) + solve.offset
 
 
-def _curvature_for(state, solve: Solve, omega_behind):
+def _curvature_for(state: "LensState", solve: Solve, omega_behind: Number) -> Number:
     """c = (ω - ω′ - K y)/(y (n′ - n)) behind which the marginal ray has ω′; K: power of the surface without c."""
     k, n = solve.surface, state.index(state.primary)
     y, omega = _marginal_ray_before(state, k)
     return ((omega - omega_behind) / y - state.further_power(k, state.primary)) / (n[k] - n[k - 1])
 
 
-def _marginal_angle(state, solve: Solve):
+def _marginal_angle(state: "LensState", solve: Solve) -> Number:
     return _curvature_for(state, solve, state.index(state.primary)[solve.surface] * solve.numbers[0])
 
 
-def _f_number(state, solve: Solve):
+def _f_number(state: "LensState", solve: Solve) -> Number:
     return _curvature_for(state, solve, -abs(state.index(state.primary)[solve.surface]) / (2 * solve.numbers[0]))
 
 
-def _marginal_height(state, solve: Solve):
+def _marginal_height(state: "LensState", solve: Solve) -> Number:
     """t = n′ (h - y)/ω′ behind the surface, of the paraxial ray, or of the real one through a part of the pupil."""
     if any(solve.numbers[1:]):
         return state.through_torch(lambda lens: [_real_height(lens, solve)])[0]
@@ -447,42 +473,42 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     (_, y, z), (_, M, N) = rays.position, rays.direction
     crosses = rays.valid & (M != 0)
     ratio = N / torch.where(crosses, M, torch.ones_like(M))
-    at = z.new_tensor(height)
-    thickness = z + ratio * (at - y) - sag_at(lens.surfaces[k + 1], torch.zeros_like(at), at)
+    y_next = z.new_tensor(height)
+    thickness = z + ratio * (y_next - y) - sag_at(lens.surfaces[k + 1], torch.zeros_like(y_next), y_next)
     return torch.where(crosses, thickness, torch.nan)
 
 
-def _edge_thickness(state, solve: Solve):
+def _edge_thickness(state: "LensState", solve: Solve) -> Number:
     """t = e + z - z′ of both surfaces at one height, by default the semi-diameter of the first."""
     k, (edge, height) = solve.surface, solve.numbers
 
     def thickness(lens: Lens) -> list[Tensor]:
-        at = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
-        near, far = (sag_at(surface, torch.zeros_like(at), at) for surface in lens.surfaces[k : k + 2])
+        y = lens.wavelengths.new_tensor(height) if height else semi_diameter(lens, k)
+        near, far = (sag_at(surface, torch.zeros_like(y), y) for surface in lens.surfaces[k : k + 2])
         return [edge - edge_thickness(0.0, near, far)]
 
     return state.through_torch(thickness)[0]
 
 
-def _power(state, solve: Solve):
+def _power(state: "LensState", solve: Solve) -> Number:
     """c = P/(n′ - n) of the power that a surface has by its curvature."""
     k, n = solve.surface, state.index(state.primary)
     return solve.numbers[0] / (n[k] - n[k - 1])
 
 
-def _position(state, solve: Solve):
+def _position(state: "LensState", solve: Solve) -> Number:
     """The thickness that completes the sum of thicknesses between surface `source` and this one."""
     k, source = solve.surface, solve.source
     others = range(source, k) if source <= k else range(k + 1, source)
     return solve.numbers[0] - sum(state.thickness[j] for j in others)
 
 
-def _focal_length(state, solve: Solve):
+def _focal_length(state: "LensState", solve: Solve) -> Number:
     """v with φ(0) + v [φ(1) - φ(0)] = |n′|/f: by Gauss's brackets the power φ of a lens is linear in each curvature and
     thickness v. It is finite where the lens is afocal."""
-    powers = []
+    powers: list[Number] = []
     for number in (0.0, 1.0):
-        state.numbers[solve.surface, solve.quantity] = number
+        state.numbers[solve.address] = number
         state.forget()
         powers.append(-state.gaussian(state.primary).C)
     wanted = abs(state.index(state.primary)[-2]) / solve.numbers[0]
@@ -490,7 +516,7 @@ def _focal_length(state, solve: Solve):
 
 
 #: The number of a state that a solve sets, by kind.
-SOLVES = {
+SOLVES: dict[str, Callable[["LensState", Solve], Number]] = {
     "pickup": _pickup,
     "marginal_angle": _marginal_angle,
     "f_number": _f_number,
@@ -507,20 +533,21 @@ _CONVERGED = 5  # units of rounding
 _SLOPES = 1e-12  # relative to the largest derivative of a number
 _FREE = 1e-9  # |1 - ∂P/∂s| of solves that leave a number free
 
-#: What a state is made of; all else is computed of it.
+#: Attributes that define a state; all others are computed from them.
 _GIVEN = {"view", "lens", "variables", "numbers", "_kept"}
 
 
 class LensState:
-    """view: `View`; variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1).
+    """A view at given variables: numbers, first-order data and rays of the lens, with derivatives.
 
-    lens: of tensors, the lens of the view in their dtype and on their device.
+    variables: (n,) numbers, a Dual of them, or a tuple of tensors, () or (L, 1, 1, 1). lens: with
+    tensors, the lens of the view in their dtype and on their device.
     """
 
-    def __init__(self, view, variables, lens: Lens | None = None):
+    def __init__(self, view: View, variables: Number, lens: Lens | None = None) -> None:
         self.view, self.lens, self.variables = view, lens or view.lens, variables
-        self.numbers: dict = view.numbers(variables)
-        self._kept: dict = {}
+        self.numbers = view.numbers(variables)
+        self._kept: dict[tuple, Any] = {}
         if view.solves:
             self._solve()
 
@@ -530,39 +557,40 @@ class LensState:
 
     @property
     def count(self) -> int:
-        """How many variables there are derivatives by; 0 where none are asked for."""
+        """The number of variables with derivatives; 0 of a state without derivatives."""
         return len(self.variables.slope) if isinstance(self.variables, Dual) else 0
 
     def fixed(self) -> "LensState":
-        """The same state without derivatives."""
+        """The state without derivatives."""
         return LensState(self.view, value_of(self.variables)) if self.count else self
 
-    def number(self, surface: int, quantity: str):
-        """A number of a surface, solved, picked up, varied or as it is stored."""
+    def number(self, surface: int, quantity: str) -> Number:
+        """A number of a surface: solved, picked up, varied or stored."""
         number = self.numbers.get((surface, quantity))
         return self.view.number((surface, quantity)) if number is None else number
 
     @cached_property
-    def thickness(self) -> list:
+    def thickness(self) -> list[Number]:
         """mm behind every surface, the object's first."""
         return self._listed("thickness", self.view.thickness)
 
     @cached_property
-    def curvature(self) -> list:
+    def curvature(self) -> list[Number]:
         """1/mm of every surface, terms of r² left out."""
         return self._listed("curvature", self.view.curvature)
 
     @cached_property
-    def vertex_curvature(self) -> list:
+    def vertex_curvature(self) -> list[Number]:
         """1/mm of every surface at its vertex, terms of r² included."""
         if self.view.is_plain:
             return [c + bend for c, bend in zip(self.curvature, self.view.further_power[0], strict=True)]
         return self.through_torch(lambda lens: [vertex_curvature(surface) for surface in lens.surfaces])
 
-    def of_surfaces(self, quantity: str):
+    def of_surfaces(self, quantity: str) -> np.ndarray | Dual:
         """A number (S,) of all surfaces, of `View.of_surfaces`; 0 where a surface has none."""
         stored = self.view.of_surfaces
-        values, slopes = (stored[quantity] if quantity in stored else 0.0 * stored["conic"]).copy(), None
+        values = (stored[quantity] if quantity in stored else 0.0 * stored["conic"]).copy()
+        slopes: np.ndarray | None = None
         for (surface, name), number in self.numbers.items():
             if name == quantity:
                 values[surface] = value_of(number)
@@ -571,14 +599,14 @@ class LensState:
                     slopes[:, surface] = number.slope
         return values if slopes is None else Dual(values, slopes)
 
-    def _listed(self, quantity: str, stored: list[float]) -> list:
-        numbers = list(stored)
+    def _listed(self, quantity: str, stored: list[float]) -> list[Number]:
+        numbers: list[Number] = list(stored)
         for (surface, name), number in self.numbers.items():
             if name == quantity:
                 numbers[surface] = number
         return numbers
 
-    def index(self, wavelength: int) -> Sequence:
+    def index(self, wavelength: int) -> Number:
         """Signed index behind every surface at a wavelength, counted from 0."""
         stored = self.view.indices[wavelength]
         if not self.view.glasses:
@@ -587,25 +615,25 @@ class LensState:
         return [np.sign(n) * self.media[k][wavelength] if k in self.media else n for n, k in pairs]
 
     @cached_property
-    def media(self) -> dict:
+    def media(self) -> dict[int, Number]:
         """Indices (W,) of variable media, by the surface in front of them; of tensors (W, ...)."""
         glasses = self.view.glasses
         if not glasses:
             return {}
-        moved = [at for addresses in glasses.values() for at in addresses]
+        moved = [address for addresses in glasses.values() for address in addresses]
         axes = max((number.dim() for number in self.variables), default=0) if self.is_of_tensors else 0
         waves = self.lens.wavelengths.reshape(-1, *[1] * axes)
         indices = self.in_one_pass(lambda lens: [index_behind(lens, k, waves) for k in glasses], only=moved)
         return dict(zip(glasses, indices, strict=True))
 
-    def power(self, k: int, wavelength: int):
+    def power(self, k: int, wavelength: int) -> Number:
         """Power in 1/mm of a surface."""
         if not self.view.is_plain:
             return self.kept(_powers, wavelength)[k - 1]
         n = self.index(wavelength)
         return self.curvature[k] * (n[k] - n[k - 1]) + self.further_power(k, wavelength)
 
-    def further_power(self, k: int, wavelength: int):
+    def further_power(self, k: int, wavelength: int) -> Number:
         """Power in 1/mm of a surface in addition to c Δn: of terms of r² and of a phase."""
         n = self.index(wavelength)
         if not self.view.is_plain:
@@ -613,7 +641,7 @@ class LensState:
         bend, phase = self.view.further_power
         return bend[k] * (n[k] - n[k - 1]) + phase[wavelength, k] if bend[k] else phase[wavelength, k]
 
-    def matrix(self, first: int, last: int, wavelength: int, *, to_next: bool = False):
+    def matrix(self, first: int, last: int, wavelength: int, *, to_next: bool = False) -> tuple[Number, ...]:
         """(A, B, C, D) from the vertex of a surface, before it, to behind another, or to the vertex after that."""
         n = self.index(wavelength)
         steps = range(first, last + 1)
@@ -624,7 +652,7 @@ class LensState:
         """The system matrices at a wavelength."""
         return self.kept(_gaussian, wavelength)
 
-    def kept(self, function: Callable, *arguments):
+    def kept(self, function: Callable[..., Kept], *arguments: Any) -> Kept:
         """function(state, *arguments), computed once."""
         key = function, *arguments
         if key not in self._kept:
@@ -638,11 +666,11 @@ class LensState:
     # -- the beam ------------------------------------------------------------------------------------------------------
 
     @cached_property
-    def vergence(self):
+    def vergence(self) -> Number:
         """n / object distance at the primary wavelength, 0 for an object at infinity."""
         return self.vergence_at(self.primary)
 
-    def vergence_at(self, wavelength: int):
+    def vergence_at(self, wavelength: int) -> Number:
         return self.index(wavelength)[0] / self.object_distance
 
     @property
@@ -650,7 +678,7 @@ class LensState:
         return bool(np.isinf(value_of(self.thickness[0])))
 
     @cached_property
-    def field_scale(self):
+    def field_scale(self) -> Number:
         """Slope or object height in mm per tan θ or mm of the fields, as `paraxial.field_scale`."""
         data, at_infinity = self.gaussian(self.primary), self.is_at_infinity
         return field_scale(
@@ -663,19 +691,19 @@ class LensState:
         )
 
     @property
-    def object_distance(self):
+    def object_distance(self) -> Number:
         distance = self.thickness[0]
         return np.finfo(float).tiny ** 0.5 if isinstance(distance, float) and distance == 0 else distance
 
     @cached_property
-    def entrance_pupil_diameter(self):
+    def entrance_pupil_diameter(self) -> Number:
         """mm, of the aperture of the lens at the primary wavelength."""
         kind, data = self.lens.aperture.kind, self.gaussian(self.primary)
         number, distance = self.number(0, "aperture"), self.thickness[0]
         return data.entrance_pupil_diameter(kind, number, distance, self.vergence, self.tan_cone)
 
     @property
-    def tan_cone(self) -> float | None:
+    def tan_cone(self) -> Number:
         """Tangent of the half angle of the cone at the object, of an aperture that is specified as one."""
         kind, number = self.lens.aperture.kind, self.number(0, "aperture")
         if kind not in CONES:
@@ -685,7 +713,7 @@ class LensState:
         return library.tan(library.arcsin(number) if kind == "object_na" else library.deg2rad(number))
 
     @cached_property
-    def marginal_height(self):
+    def marginal_height(self) -> Number:
         """mm at surface 1 of the paraxial marginal ray."""
         kind, diameter = self.lens.aperture.kind, self.entrance_pupil_diameter
         data = self.gaussian(self.primary)
@@ -695,7 +723,7 @@ class LensState:
 
     def _solve(self) -> None:
         """Solves and pickups in the order of surfaces, repeated until they converge where one depends on later ones."""
-        stored = [self.view.stored[one.surface, one.quantity] for one in self.view.solves]
+        stored = [self.view.stored[solve.address] for solve in self.view.solves]
         if not self.view.waits:
             self._passed(stored)
         elif self.is_of_tensors:
@@ -703,17 +731,17 @@ class LensState:
         else:
             self._settled(stored)
 
-    def _passed(self, solved: Sequence) -> list:
-        """What a pass through all solves makes of their numbers."""
-        passed = []
+    def _passed(self, solved: Sequence[Number]) -> list[Number]:
+        """The numbers of the solves after a pass through all of them."""
+        passed: list[Number] = []
         self._take(solved)
-        for one in self.view.solves:
-            passed.append(SOLVES[one.kind](self, one))
-            self.numbers[one.surface, one.quantity] = passed[-1]
+        for solve in self.view.solves:
+            passed.append(SOLVES[solve.kind](self, solve))
+            self.numbers[solve.address] = passed[-1]
             self.forget()
         return passed
 
-    def _settled(self, solved: Sequence) -> Sequence:
+    def _settled(self, solved: Sequence[Number]) -> Sequence[Number]:
         """The numbers of the solves that a pass does not change, with their derivatives."""
         for _ in range(_PASSES):
             before, solved = solved, self._passed(solved)
@@ -721,27 +749,27 @@ class LensState:
                 break
         return solved
 
-    def _solve_tensors(self, stored: Sequence) -> None:
+    def _solve_tensors(self, stored: Sequence[Number]) -> None:
         """The numbers s = P(s, x) of solves, P a pass through all of them, with derivatives of any number of variables.
 
         Passes without derivatives come to s. From there a step of Newton's method has the first derivatives of s by x,
         ds/dx = (1 - ∂P/∂s)⁻¹ ∂P/∂x, and a second step the second ones.
         """
-        ats = [(one.surface, one.quantity) for one in self.view.solves]
+        addresses = [solve.address for solve in self.view.solves]
 
         def passed(state: LensState, solved: Tensor) -> Tensor:
             state._passed(solved.unbind())
-            return torch.stack([number.expand(solved.shape[1:]) for number in state.tensors(ats).values()])
+            return torch.stack([number.expand(solved.shape[1:]) for number in state.tensors(addresses).values()])
 
         still = copy.copy(self)
-        still._kept, still.numbers = {}, {at: number.detach() for at, number in self.numbers.items()}
+        still._kept, still.numbers = {}, {address: number.detach() for address, number in self.numbers.items()}
         with torch.no_grad():
             still._settled(stored)
-        solved = torch.stack(torch.broadcast_tensors(*still.tensors(ats).values()))
-        unit = torch.eye(len(ats), dtype=solved.dtype, device=solved.device)
+        solved = torch.stack(torch.broadcast_tensors(*still.tensors(addresses).values()))
+        unit = torch.eye(len(addresses), dtype=solved.dtype, device=solved.device)
         units = unit.reshape(*unit.shape, *[1] * (solved.dim() - 1)).expand(-1, *solved.shape)
         with torch.enable_grad():
-            slopes = tangents_of(passed(still, with_tangents(solved, units)), len(ats))
+            slopes = tangents_of(passed(still, with_tangents(solved, units)), len(addresses))
         matrix = unit - slopes.movedim((0, 1), (-1, -2))
         is_free = torch.linalg.det(matrix).abs()[..., None, None] < _FREE
         inverse = torch.linalg.inv(torch.where(is_free, unit, matrix)).movedim((-2, -1), (0, 1))
@@ -749,20 +777,20 @@ class LensState:
             solved = solved + (inverse * (passed(self, solved) - solved)).sum(1)
         self._take(solved.unbind())
 
-    def _take(self, solved: Sequence) -> None:
-        """Other numbers of the solves."""
-        self.numbers |= {(one.surface, one.quantity): n for one, n in zip(self.view.solves, solved, strict=True)}
+    def _take(self, solved: Sequence[Number]) -> None:
+        """Set the numbers of the solves."""
+        self.numbers |= {solve.address: n for solve, n in zip(self.view.solves, solved, strict=True)}
         self.forget()
 
     def forget(self) -> None:
-        """Drop all results of numbers that have changed."""
+        """Drop results that depend on changed numbers."""
         for name in vars(self).keys() - _GIVEN:
             del vars(self)[name]
         self._kept.clear()
 
     # -- functions of torch ----------------------------------------------------------------------------------------
 
-    def through_torch(self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False) -> list:
+    def through_torch(self, function: Callable[[Lens], Sequence[Tensor]], *, clips: bool = False) -> list[Number]:
         """Few numbers () that a function takes from a lens with torch, with their derivatives, one backward pass each.
 
         clips: whether the lens has its apertures; a lens of tensors has none.
@@ -770,22 +798,24 @@ class LensState:
         if self.is_of_tensors:
             return [*function(self.moving_lens())]
         with torch.set_grad_enabled(self.count > 0):
-            leaves = {at: _tensor(number).requires_grad_() for at, number in self.numbers.items()}
+            leaves = {address: _tensor(number).requires_grad_() for address, number in self.numbers.items()}
             numbers = [n.reshape(()) for n in function((self.view.clipping if clips else self.view).held(leaves))]
         return [self._chained(number, leaves) if self.count else float(number) for number in numbers]
 
-    def _chained(self, number: Tensor, leaves: dict) -> Dual:
+    def _chained(self, number: Tensor, leaves: dict[Address, Tensor]) -> Dual:
         """A number () computed from leaves, with its derivatives by the variables."""
         value, slope = float(number.detach()), np.zeros(self.count)
         if number.requires_grad:
             by = torch.autograd.grad(number, list(leaves.values()), retain_graph=True, allow_unused=True)
-            for at, derivative in zip(leaves, by, strict=True):
-                moved = self.numbers[at]
+            for address, derivative in zip(leaves, by, strict=True):
+                moved = self.numbers[address]
                 if derivative is not None and isinstance(moved, Dual):
                     slope = slope + float(derivative) * moved.slope
         return Dual(value, slope)
 
-    def in_one_pass(self, function: Callable[[Lens], Sequence[Tensor]], only: Sequence | None = None) -> list:
+    def in_one_pass(
+        self, function: Callable[[Lens], Sequence[Tensor]], only: Sequence[Address] | None = None
+    ) -> list[Number]:
         """Numbers or arrays that a function takes from a lens with torch, with their derivatives in one forward pass.
 
         only: addresses of the numbers that the function depends on.
@@ -795,28 +825,30 @@ class LensState:
         with torch.set_grad_enabled(self.count > 0):
             return [*map(self._taken, function(self.moving_lens(only)))]
 
-    def _taken(self, number: Tensor):
+    def _taken(self, number: Tensor) -> Number:
         """A number or an array from torch, with its derivatives by the variables."""
         value = number.detach().numpy()[()]
         return Dual(value, tangents_of(number, self.count).detach().numpy()) if self.count else value
 
-    def tensors(self, only: Sequence | None = None) -> dict:
+    def tensors(self, only: Sequence[Address] | None = None) -> dict[Address, Tensor]:
         """The numbers, or some, as tensors, by address; dual ones carry their derivatives by all variables."""
-        numbers = {at: self.numbers[at] for at in only or self.numbers}
+        numbers = {address: self.numbers[address] for address in only or self.numbers}
         if self.is_of_tensors:
             like = self.lens.wavelengths
-            return {at: n if isinstance(n, Tensor) else like.new_tensor(n) for at, n in numbers.items()}
+            return {address: n if isinstance(n, Tensor) else like.new_tensor(n) for address, n in numbers.items()}
         if not self.count:
-            return {at: _tensor(number) for at, number in numbers.items()}
-        return {at: with_tangents(_tensor(n), torch.tensor(slope_of(n, self.count))) for at, n in numbers.items()}
+            return {address: _tensor(number) for address, number in numbers.items()}
+        return {
+            address: with_tangents(_tensor(n), torch.tensor(slope_of(n, self.count))) for address, n in numbers.items()
+        }
 
-    def moving_lens(self, only: Sequence | None = None) -> Lens:
+    def moving_lens(self, only: Sequence[Address] | None = None) -> Lens:
         """The lens without apertures, whose numbers carry their derivatives by all variables."""
         if self.is_of_tensors:
             return with_numbers_of(without_apertures(self.lens), self.tensors(only), self.view.places)
         return self.view.held(self.tensors(only))
 
-    def each_through_torch(self, function: Callable, arrays: Sequence):
+    def each_through_torch(self, function: Callable[..., Tensor], arrays: Sequence[Number]) -> Number:
         """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
         entries = [torch.tensor(value_of(array)) for array in arrays]
         entries = [
@@ -826,13 +858,13 @@ class LensState:
         return self.in_one_pass(lambda lens: [function(lens, *entries)])[0]
 
 
-def _tensor(number) -> Tensor:
+def _tensor(number: Number) -> Tensor:
     """The value () of a number."""
     return torch.tensor(float(value_of(number)), dtype=torch.float64)
 
 
-def _is_settled(number, before) -> bool:
-    """Whether a number of a solve, with its derivatives, is that before a pass, but for rounding."""
+def _is_settled(number: Number, before: Number) -> bool:
+    """Whether a number of a solve and its derivatives are the same before and after a pass, to rounding."""
     a, b = value_of(number), value_of(before)
     if isinstance(a, Tensor):
         return not is_any((a != b) & ~((a - b).abs() <= _CONVERGED * torch.finfo(a.dtype).eps * a.abs()))
@@ -844,13 +876,13 @@ def _is_settled(number, before) -> bool:
     return bool((change <= _SLOPES * np.abs(number.slope).max(initial=0.0)).all())
 
 
-def _powers(state: LensState, wavelength: int) -> list:
+def _powers(state: LensState, wavelength: int) -> list[Number]:
     """Powers in 1/mm of the surfaces from 1 to that before the image, of any kind of number that varies."""
 
     def powers(lens: Lens) -> list[Tensor]:
-        at, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
-        n = signed(surfaces, media(lens, at)[:-1])
-        return [power(*part, at) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
+        wavelength_um, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
+        n = signed(surfaces, media(lens, wavelength_um)[:-1])
+        return [power(*part, wavelength_um) for part in zip(surfaces, n[:-1], n[1:], strict=True)]
 
     return state.in_one_pass(powers)
 
@@ -866,19 +898,19 @@ def _gaussian(state: LensState, wavelength: int) -> Gaussian:
 
 
 def _gaussian_by_torch(state: LensState, wavelength: int) -> Gaussian:
-    """Where variables other than curvatures, thicknesses and glasses change the power of a surface."""
+    """System matrices where other variables than curvatures, thicknesses and glasses change the power of a surface."""
 
     def matrices(lens: Lens) -> list[Tensor]:
-        at = lens.wavelengths[wavelength]
-        found = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, at)[:-1]), at)
-        return [found.A, found.B, found.C, found.D, *found.front, *found.rear]
+        wavelength_um = lens.wavelengths[wavelength]
+        matrix = gaussian(lens, signed(lens.surfaces[1:-1], media(lens, wavelength_um)[:-1]), wavelength_um)
+        return [matrix.A, matrix.B, matrix.C, matrix.D, *matrix.front, *matrix.rear]
 
     A, B, C, D, A1, B1, B2, D2 = state.through_torch(matrices)
     n = state.index(wavelength)
     return Gaussian(A, B, C, D, (A1, B1), lambda: (B2, D2), n[0], n[-2])
 
 
-def listed(numbers: Sequence, count: int):
+def listed(numbers: Sequence[Number], count: int) -> np.ndarray | Dual:
     """Numbers () as one array (R,), with derivatives by `count` variables if there are any."""
     values = np.array([float(value_of(number)) for number in numbers])
     return Dual(values, np.stack([slope_of(n, count) for n in numbers], -1)) if count else values
@@ -887,7 +919,9 @@ def listed(numbers: Sequence, count: int):
 # -- rays --------------------------------------------------------------------------------------------------------------
 
 
-def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
+def launched(
+    state: LensState, field: np.ndarray, pupil: Sequence[Number] | np.ndarray
+) -> tuple[Vector, Sequence[Number], Number]:
     """Rays through the paraxial entrance pupil, as `tracing.launch` starts them: position, direction and path."""
     data = state.gaussian(state.primary)
     kind, distance = state.lens.fields.kind, state.thickness[0]
@@ -914,10 +948,12 @@ _STEPS = 12
 _CLOSE = 1e-9  # of the radius of the stop: one more step ends at rounding
 
 #: The hits (x, y) on the stop of rays through pupil points (2, W, R), and which arrive.
-AtStop = Callable[[LensState, tuple], tuple]
+AtStop: TypeAlias = Callable[[LensState, Pair], tuple[Pair, np.ndarray]]
 
 
-def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: np.ndarray):
+def aimed(
+    state: LensState, at_stop: AtStop, target: np.ndarray, radius: Number, last: np.ndarray
+) -> tuple[Pair, np.ndarray, np.ndarray]:
     """Pupil points, two of (W, R), plain or dual, which of them converged, and their values (2, W, R).
 
     state: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: initial points.
@@ -926,20 +962,21 @@ def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: n
     goal = target * value_of(radius)
     points, converged, inverse = _root(fixed, at_stop, goal, abs(value_of(radius)), last)
     if not state.count:
-        return tuple(points), converged, points
-    (x, y), _ = at_stop(state, tuple(points))
+        return (points[0], points[1]), converged, points
+    (x, y), _ = at_stop(state, (points[0], points[1]))
     slopes = [slope_of(part, state.count) for part in (target[0] * radius - x, target[1] * radius - y)]
-    moved = [inverse[k][0] * slopes[0] + inverse[k][1] * slopes[1] for k in range(2)]
-    dual = tuple(Dual(at, np.where(converged, by, 0.0)) for at, by in zip(points, moved, strict=True))
-    return dual, converged, points
+    by_x, by_y = (np.where(converged, row[0] * slopes[0] + row[1] * slopes[1], 0.0) for row in inverse)
+    return (Dual(points[0], by_x), Dual(points[1], by_y)), converged, points
 
 
-def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray):
+def _root(
+    state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[Pair, Pair]]:
     """Points (2, W, R), which of them converged, and the inverse of ∂s/∂a there, by components."""
     points, done = start.copy(), False
     for _ in range(_STEPS):
-        moving = tuple(Dual(part, np.eye(2)[:, k, None, None] * np.ones_like(part)) for k, part in enumerate(points))
-        (x, y), arrives = at_stop(state, moving)
+        a, b = (Dual(part, np.eye(2)[:, k, None, None] * np.ones_like(part)) for k, part in enumerate(points))
+        (x, y), arrives = at_stop(state, (a, b))
         missed = goal - np.stack([x.value, y.value])
         (xx, xy), (yx, yy) = x.full(), y.full()
         determinant = xx * yy - xy * yx
@@ -957,9 +994,8 @@ def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, star
 
 def rays_by_torch(
     state: LensState, function: Callable[[Lens], Rays], shape: tuple[int, int]
-) -> tuple[list, np.ndarray]:
+) -> tuple[list[Number], np.ndarray]:
     """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity."""
-
     with torch.set_grad_enabled(state.count > 0):
         rays = function(state.moving_lens())
         parts = [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl)]
@@ -985,13 +1021,15 @@ class Hits:
     Components are arrays or dual numbers, each taken from the table of the trace when it is first needed.
     """
 
-    def __init__(self, parts: Sequence, slopes: Sequence | None, valid: np.ndarray, places: np.ndarray):
+    def __init__(
+        self, parts: Sequence[np.ndarray], slopes: Sequence[np.ndarray] | None, valid: np.ndarray, places: np.ndarray
+    ) -> None:
         """parts: x, y, z, L, M, N and path (W, R) each; slopes: (n, W, R) each; places: in the flat table."""
         self._parts, self._slopes, self._valid, self._places = parts, slopes, valid, places
         self.valid = valid.reshape(-1)[places]
         self.position, self.direction = _Components(self, 0), _Components(self, 3)
 
-    def component(self, k: int):
+    def component(self, k: int) -> np.ndarray | Dual:
         value = self._parts[k].reshape(-1)[self._places]
         if self._slopes is None:
             return value
@@ -1000,31 +1038,35 @@ class Hits:
         return Dual(value, slope if self.valid.all() else np.where(self.valid, slope, 0.0))
 
     @cached_property
-    def opl(self):
+    def opl(self) -> Number:
         return self.component(6)
 
     def at(self, rays: np.ndarray) -> "Hits":
-        """Those of some rays."""
+        """The hits of some rays, by their numbers."""
         return Hits(self._parts, self._slopes, self._valid, self._places[rays])
 
 
 class _Components:
     """Three components of rays, each computed once."""
 
-    def __init__(self, hits: Hits, first: int):
-        self._hits, self._first, self._computed = hits, first, {}
+    def __init__(self, hits: Hits, first: int) -> None:
+        self._hits, self._first = hits, first
+        self._computed: dict[int, Number] = {}
 
-    def __getitem__(self, k: int):
+    def __iter__(self) -> Iterator[Number]:
+        return (self[k] for k in range(3))
+
+    def __getitem__(self, k: int) -> Number:
         if not 0 <= k < 3:
             raise IndexError(k)
         if k not in self._computed:
             self._computed[k] = self._hits.component(self._first + k)
         return self._computed[k]
 
-    def __sub__(self, other) -> Vector:
+    def __sub__(self, other: Iterable[Number]) -> Vector:
         return Vector(self) - other
 
-    def __mul__(self, factor) -> Vector:
+    def __mul__(self, factor: Number) -> Vector:
         return Vector(self) * factor
 
 
@@ -1045,13 +1087,13 @@ class Marks(NamedTuple):
 class Bundle:
     """The rays asked for of a lens in one configuration, behind the surfaces 1 to `last`."""
 
-    def __init__(self, view, last: int):
+    def __init__(self, view: View, last: int) -> None:
         self.view, self.last = view, last
         self.rays: dict[Ray, int] = {}
 
     def ask(self, wavelength: int, field: tuple[float, float], pupil: tuple[float, float]) -> int:
         """The number of a ray, by which `Hits.at` finds it."""
-        return self.rays.setdefault(Ray(wavelength, tuple(field), tuple(pupil)), len(self.rays))
+        return self.rays.setdefault(Ray(wavelength, (field[0], field[1]), (pupil[0], pupil[1])), len(self.rays))
 
     # -- computed once ------------------------------------------------------------------------------------------------
 
@@ -1085,8 +1127,8 @@ class Bundle:
         return self.view.model.opening
 
     @cached_property
-    def _template(self):
-        """Surfaces, structure and table (W, K) as stored, and the columns of what moves (`_columns`)."""
+    def _template(self) -> tuple[Sequence[Surface], Any, np.ndarray, Columns | None]:
+        """Surfaces, structure and table (W, K) as stored, and the columns of the numbers that move (`_columns`)."""
         view = self.view
         of_media = {address for addresses in view.glasses.values() for address in addresses}
         indices = torch.from_numpy(np.abs(view.indices))
@@ -1095,22 +1137,25 @@ class Bundle:
             for address, n in view.stored.items()
             if address not in of_media
         }
-        numbers |= {k: indices[:, k].clone() for k in view.glasses}
-        places, moving, first, count = {}, {}, 0, sum(number.numel() for number in numbers.values())
-        for address, number in numbers.items():
+        of_glasses = {k: indices[:, k].clone() for k in view.glasses}
+        both: dict[Any, Tensor] = {**numbers, **of_glasses}
+        places: dict[Address | int, slice] = {}
+        moving: dict[Address | int, Tensor] = {}
+        first, count = 0, sum(number.numel() for number in both.values())
+        for address, number in both.items():
             places[address] = slice(first, first := first + number.numel())
             unit = torch.eye(count, dtype=torch.float64)[:, places[address]].reshape(count, *number.shape)
             moving[address] = with_tangents(number, unit)
-        media = {k: moving[k] for k in view.glasses}
+        media = {k: moving[k] for k in of_glasses}
         with torch.enable_grad():
-            lens = view.held({address: number for address, number in moving.items() if address not in media})
+            lens = view.held({address: moving[address] for address in numbers})
             _, structure, table = view.table_of(self.last, lens, media)
-        columns = _columns(table, numbers, places)
+        columns = _columns(table, both, places)
         return view.table_of(self.last, view.lens)[0], structure, table.detach().numpy().copy(), columns
 
     @cached_property
     def is_expressible(self) -> bool:
-        """Whether the compiled trace has all the surfaces."""
+        """Whether the compiled trace supports all the surfaces."""
         return all(map(is_expressible, self.view.lens.surfaces[1 : self.last + 1]))
 
     @cached_property
@@ -1143,7 +1188,7 @@ class Bundle:
     # -- at a state ---------------------------------------------------------------------------------------------------
 
     def hits(self, state: LensState) -> Hits:
-        """All rays on surface `last`, in the order of `ask`; 0: in front of surface 1."""
+        """All rays on surface `last`, in the order of `ask`; in front of surface 1 if `last` is 0."""
         if self.last == 0:
             return self._at_object(state)
         if not self.is_expressible:
@@ -1163,38 +1208,44 @@ class Bundle:
         """All rays on all surfaces from 1 to `last`, in the order of `ask`."""
         if self.is_expressible:
             surfaces, task, changes, start, count = self._task(state, *self.launched(state))
-            found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
-            if found is not None:
+            rays = pushed_everywhere(surfaces, task, changes[: count or 0], start)
+            if rays is not None:
                 places, size, rows = self._places[0], self.field[0].size, rows_of(task.structure, surfaces)
 
                 def picked(part: Tensor) -> np.ndarray:
                     return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
 
-                by = () if count is None else map(picked, found.by_position[:2])
-                return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
+                x, y = map(picked, rays.position[:2])
+                by_x, by_y = (None, None) if count is None else map(picked, rays.by_position[:2])
+                return Marks(x, y, picked(rays.valid), by_x, by_y)
         hits = [bundle.hits(state) for bundle in self._each]
         parts = [[hit.position[k] for hit in hits] for k in range(2)]
-        values = (np.stack([value_of(one) for one in part]) for part in parts)
-        slopes = (np.stack([slope_of(one, state.count) for one in part]) for part in parts if state.count)
-        return Marks(*values, np.stack([hit.valid for hit in hits]), *slopes)
+        x, y = (np.stack([value_of(number) for number in part]) for part in parts)
+        slopes = ([slope_of(number, state.count) for number in part] for part in parts)
+        by_x, by_y = map(np.stack, slopes) if state.count else (None, None)
+        return Marks(x, y, np.stack([hit.valid for hit in hits]), by_x, by_y)
 
     @cached_property
     def _each(self) -> list["Bundle"]:
         return [self.on(surface) for surface in range(1, self.last + 1)]
 
-    def _traced(self, state: LensState, position, direction, opl, valid: np.ndarray):
+    def _traced(
+        self, state: LensState, position: Sequence[Number], direction: Sequence[Number], opl: Number, valid: np.ndarray
+    ) -> tuple[Any, int | None]:
         """Rays behind surface `last` as a table, and by how many variables they change, if any."""
         surfaces, task, changes, start, count = self._task(state, position, direction, opl, valid)
         return (ends(surfaces, task) if count is None else pushed(surfaces, task, changes, start)), count
 
-    def _task(self, state: LensState, position, direction, opl, valid: np.ndarray):
-        """Surfaces, what to trace, how table and rays change, and by how many variables, if any."""
+    def _task(
+        self, state: LensState, position: Sequence[Number], direction: Sequence[Number], opl: Number, valid: np.ndarray
+    ) -> tuple[Sequence[Surface], Task, Tensor, tuple[Tensor, Tensor, Tensor] | None, int | None]:
+        """Surfaces, task of the trace, changes of table and rays, and by how many variables, None without changes."""
         surfaces, structure, *_ = self._template
         table, changes = self.table(state)
         moving = [part for part in (*position, *direction, opl) if isinstance(part, Dual)]
         given = [np.stack([value_of(p) for p in part]) for part in (position, direction)] + [value_of(opl)]
-        given = [torch.from_numpy(np.ascontiguousarray(part)) for part in given]
-        task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
+        points, along, path = (torch.from_numpy(np.ascontiguousarray(part)) for part in given)
+        task = Task(structure, torch.from_numpy(valid), (points, along, path, torch.from_numpy(table)))
         count = state.count or max((len(part.slope) for part in moving), default=0)
         if not count:
             return surfaces, task, torch.from_numpy(changes), None, None
@@ -1210,11 +1261,11 @@ class Bundle:
         position, direction, opl, valid = self.launched(state)
         return self._as_hits(state, (*position, *direction, opl), valid)
 
-    def _as_hits(self, state: LensState, parts, valid: np.ndarray) -> Hits:
+    def _as_hits(self, state: LensState, parts: Sequence[Number], valid: np.ndarray) -> Hits:
         slopes = [slope_of(part, state.count) for part in parts] if state.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
-    def _hits(self, end, count: int | None) -> Hits:
+    def _hits(self, end: Any, count: int | None) -> Hits:
         """The rays of `ask`, from the table of a trace."""
         parts = [*end.position.numpy(), *end.direction.numpy(), end.opl.numpy()]
         slopes = None
@@ -1229,12 +1280,12 @@ class Bundle:
             return self._table_by_torch(state)
         table = stored.copy()
         changes = np.zeros((state.count, *table.shape))
-        for at, number in state.numbers.items():
-            if at not in columns:
+        for address, number in state.numbers.items():
+            if address not in columns:
                 continue
-            table[:, columns[at]] = value_of(number)
+            table[:, columns[address]] = value_of(number)
             if isinstance(number, Dual):
-                changes[:, :, columns[at]] = number.slope[:, None, None]
+                changes[:, :, columns[address]] = number.slope[:, None, None]
         for surface, index in state.media.items():
             if surface in columns:
                 table[:, columns[surface]] = value_of(index)[:, None]
@@ -1247,28 +1298,28 @@ class Bundle:
             table = self.view.table_of(self.last, state.moving_lens())[2]
         return table.detach().numpy(), tangents_of(table, state.count).detach().numpy()
 
-    def launched(self, state: LensState):
+    def launched(self, state: LensState) -> Launch:
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
             parts, valid = rays_by_torch(state, self._start_by_torch, self.field.shape[1:])
             return parts[:3], parts[3:6], parts[6], valid
         if not self._aims:
             return self._through(state, self.pupil)
-        pupil, found = self._aimed(state)
-        *rays, valid = self._through(state, pupil)
-        return *rays, valid & found
+        pupil, aimed = self._aimed(state)
+        position, direction, opl, valid = self._through(state, pupil)
+        return position, direction, opl, valid & aimed
 
-    def _through(self, state: LensState, pupil):
+    def _through(self, state: LensState, pupil: Pair | np.ndarray) -> Launch:
         shape = self.field.shape[1:]
         position, direction, opl = launched(state, self.field, pupil)
         filled = [part + np.zeros(shape) for part in (*position, *direction, opl)]
         return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
 
-    def _aimed(self, state: LensState):
+    def _aimed(self, state: LensState) -> tuple[Pair, np.ndarray]:
         """Pupil points, two of (W, R), whose rays pass the stop at `pupil`, and which of them converged."""
         stop, shape = self._at_stop, self.field.shape[1:]
 
-        def at_stop(state: LensState, pupil):
+        def at_stop(state: LensState, pupil: Pair) -> tuple[Pair, np.ndarray]:
             end, count = stop._traced(state, *self._through(state, pupil))
             x, y = end.position[:2].numpy()
             if count is None:
@@ -1281,14 +1332,14 @@ class Bundle:
         if not converged.all() and self._last_aim is not self.pupil:
             pupil, converged, points = aimed(state, at_stop, self.pupil, radius, self.pupil)
         self._last_aim = np.where(converged, points, self.pupil)
-        return tuple(part + np.zeros(shape) for part in pupil), converged
+        return (pupil[0] + np.zeros(shape), pupil[1] + np.zeros(shape)), converged
 
     @cached_property
     def _last_aim(self) -> np.ndarray:
-        """The pupil points of the last aiming, where the next one starts."""
+        """The pupil points of the last aiming, from which the next aiming starts."""
         return self.pupil
 
-    def _stop_radius(self, state: LensState):
+    def _stop_radius(self, state: LensState) -> Number:
         """mm, negative where the entrance pupil is an inverted image of the stop."""
         lens = self.view.lens
         paraxial = 0.5 * state.entrance_pupil_diameter * state.gaussian(state.primary).front[0]
@@ -1317,17 +1368,18 @@ class Bundle:
         return self._as_hits(state, parts, valid)
 
 
-def _columns(table: Tensor, numbers: dict, places: dict[object, slice]) -> dict | None:
+def _columns(table: Tensor, numbers: Mapping[Any, Tensor], places: Mapping[Any, slice]) -> Columns | None:
     """The columns of a table (W, K) that hold a number unchanged, by address; None if one holds a function of a number.
 
     The table carries its derivatives by the entries of all numbers, () or (W,), at their places.
     """
-    columns, values = {}, table.detach().numpy()
+    columns: Columns = {}
+    values = table.detach().numpy()
     by = tangents_of(table, max((place.stop for place in places.values()), default=0)).detach().numpy()
     for address, number in numbers.items():
-        number, derivative = number.numpy(), by[places[address]]  # (1 or W, W, K)
-        held = (values == (number if number.ndim == 0 else number[:, None])).all(0)
-        unchanged = np.eye(len(values))[:, :, None] if number.ndim else np.ones((1, len(values), 1))
+        stored, derivative = number.numpy(), by[places[address]]  # (1 or W, W, K)
+        held = (values == (stored if stored.ndim == 0 else stored[:, None])).all(0)
+        unchanged = np.eye(len(values))[:, :, None] if stored.ndim else np.ones((1, len(values), 1))
         moving = (derivative != 0).any((0, 1))
         if not (held[moving].all() and (derivative[:, :, moving] == unchanged).all()):
             return None

@@ -25,10 +25,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from graphlib import CycleError, TopologicalSorter
 from numbers import Integral
+from typing import Any, NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
+from torch import Tensor
 
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, slope_of, value_of
 from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.operands.boundaries import AT_RIM, BOUNDARIES
 from raytrace.optimization.operands.operand import (
@@ -62,6 +64,10 @@ class BadMerit(RaytraceError, ValueError):
     """A merit function that cannot be made; the message names the row, the value and the values expected."""
 
 
+#: A range of thicknesses, mm, or its text.
+Thicknesses: TypeAlias = str | tuple[float, float] | None
+
+
 @dataclass(frozen=True)
 class Boundaries:
     """Limits of thicknesses, mm: (minimum, maximum) on the axis, of glass and of air; edge: minimum at the edge.
@@ -75,12 +81,10 @@ class Boundaries:
     edge: float | None = None
 
     @classmethod
-    def of(
-        cls, glass_thickness: str | tuple[float, float] | None, air_thickness: str | tuple[float, float] | None, edge
-    ) -> "Boundaries":
-        """From ranges, which may be text as "2:15", or "2" without a maximum. Raises ValueError."""
-        ranges = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
-        return cls(*ranges, edge)
+    def of(cls, glass_thickness: Thicknesses, air_thickness: Thicknesses, edge: float | None) -> "Boundaries":
+        """The limits of ranges, or of their text: "2:15", or "2" without a maximum. Raises ValueError."""
+        glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+        return cls(glass, air, edge)
 
     def rows(self, lens: Lens) -> Iterator[Row]:
         """The rows, each over all surfaces."""
@@ -124,12 +128,12 @@ class DefaultMerit:
     frequencies: Sequence[float] = ()
     field_weights: Sequence[float] | None = None
     wavelength_weights: Sequence[float] | None = None
-    glass_thickness: str | tuple[float, float] | None = None
-    air_thickness: str | tuple[float, float] | None = None
+    glass_thickness: Thicknesses = None
+    air_thickness: Thicknesses = None
     edge: float | None = None
     conventions: Conventions | str | Sequence[str] | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise BadMerit(
                 f"{option('merit', self.kind)}: expected one of {', '.join(KINDS)}{did_you_mean(self.kind, KINDS)}"
@@ -198,8 +202,8 @@ def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
             share = np.pi * weight * field_weight / (len(colours) * len(fields) * len(angles))
             for angle in angles if share else ():
                 for radius, g in zip(np.sqrt(0.5 * (nodes + 1)), 0.5 * weights, strict=True):
-                    pupil = (round(float(radius * part), 15) + 0.0 for part in (np.cos(angle), np.sin(angle)))
-                    yield Row(operand, (0, wavelength), (*field, *pupil), weight=float(share * g))
+                    x, y = (round(float(radius * part), 15) + 0.0 for part in (np.cos(angle), np.sin(angle)))
+                    yield Row(operand, (0, wavelength), (*field, x, y), weight=float(share * g))
 
 
 def _by_frequencies(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
@@ -221,22 +225,22 @@ def _fields(lens: Lens, settings: DefaultMerit) -> list[tuple[tuple[float, float
     return [(tuple(point), weight) for point, weight in zip(points.tolist(), weights, strict=True)]
 
 
-def _weights(of_lens, weights: Sequence[float] | None, kind: str) -> list[float]:
+def _weights(of_lens: Tensor, weights: Sequence[float] | None, kind: str) -> list[float]:
     """The weights of fields or wavelengths, by default those of the lens. Raises BadMerit."""
     if weights is None:
         return of_lens.detach().tolist()
-    weights = np.atleast_1d(weights).astype(float).tolist()
-    if len(weights) != len(of_lens):
-        raise BadMerit(f"{option(f'{kind}_weights')}: {len(weights)} weights, and the lens has {len(of_lens)} {kind}s")
-    if not (min(weights) >= 0 and sum(weights) > 0):
+    numbers = np.atleast_1d(weights).astype(float)
+    if len(numbers) != len(of_lens):
+        raise BadMerit(f"{option(f'{kind}_weights')}: {len(numbers)} weights, and the lens has {len(of_lens)} {kind}s")
+    if not (numbers.min() >= 0 and numbers.sum() > 0):
         raise BadMerit(f"{option(f'{kind}_weights')}: expected 0 or more, not all of them 0")
-    return weights
+    return numbers.tolist()
 
 
-def _refuse_many(rows: int, what: str) -> None:
+def _refuse_many(rows: int, settings: str) -> None:
     """Raise BadMerit for more rows than MOST_ROWS, before one is made."""
     if rows > MOST_ROWS:
-        raise BadMerit(f"{what}: {rows:,} rows of a merit function, expected at most {MOST_ROWS:,}; ask for fewer")
+        raise BadMerit(f"{settings}: {rows:,} rows of a merit function, expected at most {MOST_ROWS:,}; ask for fewer")
 
 
 def _arm_count(lens: Lens, field: tuple[float, float], arms: int) -> int:
@@ -263,14 +267,22 @@ KINDS = {
 # -- merit functions as values -----------------------------------------------------------------------------------------
 
 
+class RowOptions(TypedDict):
+    """Options of the evaluation of rows, as of `Evaluation`."""
+
+    unit: float
+    skip_unknown: bool
+    conventions: Conventions | None
+
+
 @dataclass(frozen=True)
 class Merit:
     """Rows of a merit function, in order; `rows[i - 1]` is row i.
 
-    unit: mm in the unit of length of targets and values, which matters beside rows of pure numbers or waves.
+    unit: mm in the unit of length of targets and values, by which lengths are weighted relative to numbers and waves.
     conventions: of operands whose meaning the file's program leaves open, as "opd_tilt=common" (`Conventions`);
-    skip_unknown: leave rows of unknown operands out. boundaries: those among the rows, between which `search`
-    spreads its starts. Raises ValueError for other conventions.
+    skip_unknown: leave rows of unknown operands out. boundaries: the boundaries among the rows, between which
+    `search` spreads its starts. Raises ValueError for other conventions.
     """
 
     rows: tuple[Row, ...] = ()
@@ -280,7 +292,7 @@ class Merit:
     skip_unknown: bool = False
     boundaries: Boundaries = dataclasses.field(default_factory=Boundaries)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "conventions", conventions_of(self.conventions))
 
     @classmethod
@@ -288,8 +300,8 @@ class Merit:
         cls,
         lens: Lens,
         *,
-        glass_thickness: str | tuple[float, float] | None = None,
-        air_thickness: str | tuple[float, float] | None = None,
+        glass_thickness: Thicknesses = None,
+        air_thickness: Thicknesses = None,
         edge: float | None = None,
         conventions: Conventions | str | Sequence[str] | None = None,
         skip_unknown: bool = False,
@@ -301,15 +313,22 @@ class Merit:
         if lens.optimization_data is None or not lens.optimization_data.merit:
             raise BadMerit(f"the lens has no merit function of its own: choose one by {option('merit', 'spot')}")
         boundaries = Boundaries.of(glass_thickness, air_thickness, edge)
-        options = {"conventions": conventions, "skip_unknown": skip_unknown, "boundaries": boundaries}
-        stored = cls(lens.optimization_data.merit, lens.optimization_data.unit, **options)
+        stored = cls(
+            lens.optimization_data.merit, lens.optimization_data.unit, conventions=conventions,
+            skip_unknown=skip_unknown, boundaries=boundaries,
+        )  # fmt: skip
         limits = boundary_rows(lens, boundaries)
         return stored + Merit(limits) if limits else stored
 
     @classmethod
-    def default(cls, lens: Lens, kind: str = "spot", **settings) -> "Merit":
+    def default(cls, lens: Lens, kind: str = "spot", **settings: Any) -> "Merit":
         """A default merit function of the lens, in mm; settings: those of `DefaultMerit`."""
         return merit_for(lens, DefaultMerit(kind, **settings))
+
+    @property
+    def options(self) -> RowOptions:
+        """The options of the evaluation of these rows."""
+        return {"unit": self.unit, "skip_unknown": self.skip_unknown, "conventions": conventions_of(self.conventions)}
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -335,21 +354,23 @@ class Merit:
         return Merit(tuple(other)) + self
 
     def __mul__(self, factor: float) -> "Merit":
-        """With all weights larger."""
+        """The merit function with all weights multiplied by a factor."""
         rows = tuple(dataclasses.replace(row, weight=row.weight * factor) for row in self.rows)
         return dataclasses.replace(self, rows=rows)
 
     __rmul__ = __mul__
 
     def with_weights(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
-        """With other weights, by the number of a row or for all rows of an operand. Raises BadMerit."""
-        return self._with("weight", by_row or {}, by_operand)
+        """The merit function with other weights, by number of a row or for all rows of an operand. Raises BadMerit."""
+        return self._with(lambda row, weight: dataclasses.replace(row, weight=weight), by_row or {}, by_operand)
 
     def with_targets(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
-        """With other targets, by the number of a row or for all rows of an operand. Raises BadMerit."""
-        return self._with("target", by_row or {}, by_operand)
+        """The merit function with other targets, by number of a row or for all rows of an operand. Raises BadMerit."""
+        return self._with(lambda row, target: dataclasses.replace(row, target=target), by_row or {}, by_operand)
 
-    def _with(self, name: str, by_row: Mapping[int, float], by_operand: Mapping[str, float]) -> "Merit":
+    def _with(
+        self, replaced: Callable[[Row, float], Row], by_row: Mapping[int, float], by_operand: Mapping[str, float]
+    ) -> "Merit":
         known = dict.fromkeys(row.name for row in self.rows)
         for operand in by_operand:
             if operand not in known:
@@ -360,7 +381,7 @@ class Merit:
 
         def changed(number: int, row: Row) -> Row:
             value = by_row.get(number, by_operand.get(row.name))
-            return row if value is None else dataclasses.replace(row, **{name: float(value)})
+            return row if value is None else replaced(row, float(value))
 
         return dataclasses.replace(self, rows=tuple(changed(*pair) for pair in enumerate(self.rows, 1)))
 
@@ -379,9 +400,9 @@ def merit_for(
     merit: "Merit | DefaultMerit | Sequence[Row] | str | None" = None,
     configurations: Sequence[int] | None = None,
 ) -> Merit:
-    """A merit function as a value: as it is, of rows, of the settings or the name of a default one, or the file's.
+    """The `Merit` of a merit function: of rows, of the settings or kind of a default one, by default the file's.
 
-    configurations: those of the rows of a default one, from 1; by default all. Raises BadMerit.
+    configurations: of the rows of a default one, from 1; by default all. Raises BadMerit.
     """
     if merit is None:
         return Merit.of(lens)
@@ -394,7 +415,7 @@ def merit_for(
 
 
 def merit_of_options(
-    lens: Lens, merit: str | None = None, *, skip_unknown: bool = False, **settings
+    lens: Lens, merit: str | None = None, *, skip_unknown: bool = False, **settings: Any
 ) -> Merit | DefaultMerit:
     """The merit function of the options of a command: a default one of that kind, or the file's. Raises BadMerit."""
     if merit is not None:
@@ -410,11 +431,11 @@ def arguments(row: Row) -> str:
     """The arguments of a row as text: its integers with their meaning, if known, and its four numbers."""
     operand = OPERANDS.get(row.operand)
     takes = operand.takes if operand is not None else ("", "")
-    named = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
-    plain = [] if named or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
+    integers = [f"{kind} {number}" for kind, number in zip(takes, row.integers, strict=True) if kind and number]
+    plain = [] if integers or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
     numbers = [f"{number:.6g}" for number in row.numbers]
     has_numbers = any(row.numbers) and not (row.operand in BOUNDARIES and row.numbers == AT_RIM)
-    return "  ".join([*named, *plain, *([" ".join(numbers)] if has_numbers else [])])
+    return "  ".join([*integers, *plain, *([" ".join(numbers)] if has_numbers else [])])
 
 
 def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
@@ -427,13 +448,13 @@ def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
 
 
 def in_unit(row: Row, before: float, after: float) -> Row:
-    """The row with its target in another unit of length; both in mm."""
+    """The row with its target in another unit of length; before, after: the units in mm."""
     power = OPERANDS[row.operand].length if row.operand in OPERANDS else 0
     return dataclasses.replace(row, target=row.target * (before / after) ** power) if power else row
 
 
 def _moved(row: Row, by: int) -> Row:
-    """A row moved down with the rows that it refers to."""
+    """A row moved down by some rows, with its references to other rows."""
     operand = OPERANDS.get(row.operand)
     if operand is None or operand.refers is None:
         return row
@@ -453,28 +474,37 @@ class UnknownOperand(RaytraceError, ValueError):
     """A row with weight whose operand is not known."""
 
 
+class Excesses(NamedTuple):
+    """Excesses e (K,) of the rows of a one-sided operand: the row, from 0, of each, its derivatives (K, n), n = 0 where
+    none are asked for, and its surface."""
+
+    rows: np.ndarray
+    excess: np.ndarray
+    slope: np.ndarray
+    surfaces: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True)
 class Evaluated:
     """A merit function at given variables.
 
     values: (R,) of all rows, nan for text and rows of unknown operands; lost: (R,) bool. residuals: (m,) whose squares
-    sum up to M²; jacobian: (m, n) their derivatives by the variables; of_row: (m,) the row, from 0, of each.
-    sides: of one-sided rows, whose residual is Σ max(0, e), by operand: the rows (K,), e (K,), by the variables (K, n),
-    and the surfaces (K,).
+    sum up to M²; jacobian: (m, n) their derivatives by the variables, (m, 0) where none are asked for; of_row: (m,) the
+    row, from 0, of each. sides: of one-sided rows, whose residual is Σ max(0, e), by operand.
     """
 
     values: np.ndarray
     lost: np.ndarray
     residuals: np.ndarray
-    jacobian: np.ndarray | None
+    jacobian: np.ndarray
     of_row: np.ndarray
-    sides: tuple[tuple, ...] = ()
+    sides: tuple[Excesses, ...] = ()
 
     @property
     def merit(self) -> float:
         return float(np.sqrt(self.residuals @ self.residuals))
 
-    def contributions(self, rows: Sequence[int]) -> np.ndarray:
+    def contributions(self, rows: Sequence[int] | np.ndarray) -> np.ndarray:
         """Parts (K,) of some rows, from 0, in the sum of their squares."""
         squares = np.bincount(self.of_row, self.residuals**2, minlength=len(self.values))[rows]
         return squares / max(squares.sum(), 1e-300)
@@ -530,9 +560,9 @@ class Evaluation:
             planner = planners[settings]
             self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
         self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
-        #: Rows that others take values of.
+        #: Rows whose values rows of arithmetic take.
         self.needed = frozenset(row for rows in referred.values() for row in rows)
-        #: Rows with a weight, and all that rows of arithmetic among them take values of.
+        #: Rows with a weight, and all rows whose values they take.
         self.counted: set[int] = set()
         left = [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
         while left:
@@ -542,7 +572,7 @@ class Evaluation:
                 left += referred.get(number, ())
         return sorted(skipped)
 
-    def _lines(self):
+    def _lines(self) -> Iterator[tuple[tuple[int, int], Line]]:
         """Rows that have a value, each with the configuration and the primary wavelength of the settings above it."""
         lens = self.model.lens
         configuration, primary = lens.current_configuration, lens.primary_wavelength - 1
@@ -556,7 +586,7 @@ class Evaluation:
                 yield (configuration, primary), line
 
     def _referred(self, placed: dict, skip_unknown: bool) -> tuple[dict[int, Sequence[int]], set[int]]:
-        """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
+        """The rows whose values each row of arithmetic takes, and the rows that cannot be evaluated."""
         referred, skipped = {}, set()
 
         def skip(line: Line, why: str, meant: str = "") -> None:
@@ -570,9 +600,9 @@ class Evaluation:
         for number, (_, line) in placed.items():
             name = line.row.operand
             if name not in OPERANDS:
-                skip(line, f"operand {name} is not known", did_you_mean(name, OPERANDS))
-            elif OPERANDS[name].refers:
-                referred[number] = OPERANDS[name].refers(line, self.rows)
+                skip(line, f"operand {name} is not known", did_you_mean(name, map(str, OPERANDS)))
+            elif refers := OPERANDS[name].refers:
+                referred[number] = refers(line, self.rows)
         for number in in_order(referred):
             if missing := skipped.intersection(referred[number]):
                 line, first = placed[number][1], min(missing)
@@ -585,13 +615,17 @@ class Evaluation:
     ) -> Evaluated:
         """All rows at variables; derivatives: with the Jacobian, by some of the variables or, without `by`, all.
 
-        shown: also operands without a row that counts.
+        shown: with operands none of whose rows has a weight.
         """
         each = np.eye(len(variables))[slice(None) if by is None else list(by)]
         count = len(each)
         x = Dual(np.asarray(variables, dtype=float), each) if derivatives else np.asarray(variables, float)
-        values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
-        numbers, sides = {}, []
+        values = np.full(len(self.rows), np.nan)
+        errors: list[np.ndarray] = []
+        slopes: list[np.ndarray] = []
+        rows: list[np.ndarray] = []
+        numbers: dict[int, Number] = {}
+        sides: list[Excesses] = []
         states = {configuration: self.model.views[configuration - 1].state(x) for configuration, _ in self.planners}
         contexts = {
             id(planner): EvaluationContext(planner, states[configuration], numbers)
@@ -603,7 +637,7 @@ class Evaluation:
             places = np.array([line.number - 1 for line in lines])
             units = self.units[places]
             group = evaluate(contexts[id(planner)])
-            sides += self._sides(group, places, units, count if derivatives else None)
+            sides += self._sides(group, places, units, count if derivatives else 0)
             all_values, parts = group.values / units, [part / units for part in group.parts]
             values[places] = value_of(all_values)
             numbers |= {line.number: all_values[k] for k, line in enumerate(lines) if line.number in self.needed}
@@ -617,26 +651,26 @@ class Evaluation:
                 if not chosen.any():
                     continue
                 factor = self.factors[places][chosen]
-                errors = factor * (value_of(number)[..., chosen] - target[chosen])
-                residuals.append(errors.ravel())
+                error = factor * (value_of(number)[..., chosen] - target[chosen])
+                errors.append(error.ravel())
                 if derivatives:
                     slopes.append((factor * slope_of(number, count)[..., chosen]).reshape(count, -1).T)
-                of_row.append(np.broadcast_to(places[chosen], errors.shape).ravel())
-        of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)
-        residual = np.concatenate(residuals) if residuals else np.zeros(0)
-        gone = ~np.isfinite(residual)
-        parts = np.bincount(of_row, minlength=len(self.rows))[of_row]
-        residual = np.where(gone, LOST * self.factors[of_row] / np.sqrt(np.maximum(parts, 1)), residual)
-        jacobian = None
+                rows.append(np.broadcast_to(places[chosen], error.shape).ravel())
+        of_row = np.concatenate(rows) if rows else np.zeros(0, dtype=int)
+        residuals = np.concatenate(errors) if errors else np.zeros(0)
+        gone = ~np.isfinite(residuals)
+        shared = np.bincount(of_row, minlength=len(self.rows))[of_row]
+        residuals = np.where(gone, LOST * self.factors[of_row] / np.sqrt(np.maximum(shared, 1)), residuals)
+        jacobian = np.zeros((len(residuals), 0))
         if derivatives:
             jacobian = np.concatenate(slopes) if slopes else np.zeros((0, count))
             jacobian = np.where(gone[:, None], 0.0, jacobian)
         lost = np.zeros(len(self.rows), dtype=bool)
         lost[of_row[gone]] = True
-        return Evaluated(values, lost, residual, jacobian, of_row, tuple(sides))
+        return Evaluated(values, lost, residuals, jacobian, of_row, tuple(sides))
 
-    def _sides(self, group: RowValues, places: np.ndarray, units: np.ndarray, count: int | None):
-        """One-sided rows of an operand, as in `Evaluated.sides`, except those that are nan."""
+    def _sides(self, group: RowValues, places: np.ndarray, units: np.ndarray, count: int) -> Iterator[Excesses]:
+        """The excesses of one-sided rows of an operand, except those that are nan, and `count` derivatives."""
         if not group.sides:
             return
         rows, excess, surfaces = group.sides
@@ -644,14 +678,14 @@ class Evaluation:
         chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
         if chosen.any():
             scale = (self.factors[places] / units)[rows[chosen]]
-            slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
-            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen]
+            slope = (scale * slope_of(excess, count)[:, chosen]).T
+            yield Excesses(places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen])
 
 
 def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
-    """Rows of arithmetic, each after those that it takes values of. Raises Circle.
+    """Rows of arithmetic, each after the rows whose values it takes. Raises Circle.
 
-    referred: the rows whose values each takes, by its own number.
+    referred: these rows, by the number of the row of arithmetic.
     """
     try:
         return [row for row in TopologicalSorter(referred).static_order() if row in referred]

@@ -7,18 +7,18 @@ operand by its arguments.
 Rows of positive weight are squared; rows of negative weight, and constraints, are conditions that are met exactly.
 
 Failed rays are charged by the amount by which each misses the surface at which it fails, with derivatives that lead it
-back. A ray that misses a conic has a negative discriminant; for one that is totally reflected the sine of refraction
-is above 1:
+back. A ray that misses a conic has a negative discriminant; for a totally reflected ray the sine of refraction is
+above 1:
 
     A t² + 2 B t + C = 0,  missed by A C - B²;    (n/n')² sin² I - 1
 
-Both are dimensionless and 0 where the ray just passes. At any other surface it is the distance of the ray beyond the
-vertex sphere, c² r².
+Both are dimensionless and 0 where the ray just passes. At other surfaces the amount is the distance of the ray beyond
+the vertex sphere, c² r².
 """
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -28,10 +28,10 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.chief import SAMPLES
-from raytrace.maths.numerics import Dual, slope_of, value_of
-from raytrace.optimization.least_squares import Sides, State
-from raytrace.optimization.lens_state import Bundle, LensState, Ray
-from raytrace.optimization.merit import LOST, Evaluated, Evaluation, in_unit
+from raytrace.maths.numerics import Dual, Number, slope_of, value_of
+from raytrace.optimization.least_squares import Sides, SumOfSquares
+from raytrace.optimization.lens_state import Bundle, Hits, LensState, Ray, View
+from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, in_unit
 from raytrace.optimization.operands.aberrations import unvignetted
 from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
@@ -63,7 +63,7 @@ class Condition:
     name: str = ""
 
 
-#: The arguments of a row: two whole numbers, four numbers.
+#: The arguments of a row: two integers and four numbers.
 Arguments = tuple[tuple[int, int], tuple[float, float, float, float]]
 
 _NONE: Arguments = ((0, 0), (0.0, 0.0, 0.0, 0.0))
@@ -86,9 +86,11 @@ def conditions_of(lens: Lens, hold: str | Sequence[str] | None) -> tuple[Conditi
 
 def conditions_in_unit(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
     """The conditions of `hold`, from mm to the unit of length of the merit function."""
-    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
-    conditions = conditions_of(lens, hold) if in_words else hold
-    return tuple(dataclasses.replace(one, row=in_unit(one.row, 1.0, unit)) for one in conditions)
+    listed = [hold] if isinstance(hold, str) else hold or ()
+    words = [word for word in listed if isinstance(word, str)]
+    values = [condition for condition in listed if isinstance(condition, Condition)]
+    conditions = (*conditions_of(lens, words), *values)
+    return tuple(dataclasses.replace(condition, row=in_unit(condition.row, 1.0, unit)) for condition in conditions)
 
 
 def _condition(lens: Lens, word: str) -> Condition:
@@ -108,7 +110,9 @@ def _condition(lens: Lens, word: str) -> Condition:
         known, arguments = Word("TTHI", "a sum of thicknesses"), ((first, last), _NONE[1])
     elif operand := re.fullmatch(r"([A-Z][A-Z0-9]{3})(?:\(([^()]*)\))?", name):
         if operand[1] not in OPERANDS:
-            raise BadHold(f"{option('hold')}: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], OPERANDS)}")
+            raise BadHold(
+                f"{option('hold')}: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], map(str, OPERANDS))}"
+            )
         known, arguments = Word(operand[1], "", ""), _arguments(operand[2] or "", word)
     else:
         meant = f"; did you mean {_INSTEAD[name.lower()]}?" if name.lower() in _INSTEAD else did_you_mean(name, WORDS)
@@ -129,7 +133,7 @@ def _condition(lens: Lens, word: str) -> Condition:
 
 
 def _arguments(text: str, word: str) -> Arguments:
-    """Arguments as in a row: two whole numbers, then up to four numbers."""
+    """The arguments of a row from text: two integers, then up to four numbers."""
     try:
         numbers = [float(part) for part in text.split(",") if part]
         first = [int(part) for part in numbers[:2]]
@@ -147,7 +151,7 @@ def _arguments(text: str, word: str) -> Arguments:
 
 
 def _behind_the_lens(lens: Lens) -> Arguments:
-    """From the last powered surface to the image."""
+    """The gaps from the last powered surface to the image."""
     bending = [k for k in range(1, sensor(lens) + 1) if has_power(lens, k)]
     return (max(bending, default=1), sensor(lens)), _NONE[1]
 
@@ -176,7 +180,7 @@ def _outer_colours(lens: Lens) -> Arguments:
     return (int(lens.wavelengths.argmin()) + 1, int(lens.wavelengths.argmax()) + 1), _NONE[1]
 
 
-#: Names of quantities in other programs, and the name here.
+#: Names of quantities in other programs, and their name in constraint syntax.
 _INSTEAD = {
     **dict.fromkeys(("bfl", "back_focal_length", "back_focal_distance"), "bfd"),
     **dict.fromkeys(("focal_length", "effective_focal_length", "efy"), "efl"),
@@ -222,16 +226,18 @@ class Recovery:
 
     def __init__(self, evaluation: Evaluation):
         self.planners = {line.number - 1: (planner, line) for planner, lines, _ in evaluation.groups for line in lines}
-        self._bundles: dict = {}
+        self._bundles: dict[tuple, tuple[Bundle, np.ndarray]] = {}
 
-    def excess(self, x: np.ndarray, rows: Sequence[int], *, derivatives: bool) -> tuple[np.ndarray, ...]:
+    def excess(
+        self, x: np.ndarray, rows: np.ndarray, *, derivatives: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Amounts (K,) by which the rays of rows (K,), from 0, miss, by variables (K, n), and number of surfaces left.
 
-        0 of a ray along the surface, as behind a break of 90°: no derivative leads back.
+        The amount is 0 for a ray along the surface, as behind a break of 90°, which no derivative brings back.
         """
         variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
         missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
-        by_view: dict = {}
+        by_view: dict[View, list[tuple[int, Ray]]] = {}
         for place, row in enumerate(rows):
             planner, line = self.planners[row]
             ray = Ray(line.wavelength, line.field, line.pupil)
@@ -247,7 +253,7 @@ class Recovery:
                     missed[place], slopes[place] = float(value_of(miss)), slope
         return missed, slopes, behind
 
-    def _missed(self, view, state: LensState, wanted: list[tuple[int, Ray]]):
+    def _missed(self, view: View, state: LensState, wanted: list[tuple[int, Ray]]) -> Iterator[tuple[int, Number, int]]:
         """(place, miss, surfaces left) of every ray that fails on its way to the image."""
         rays = tuple(dict.fromkeys(ray for _, ray in wanted))
         failed: dict[Ray, int] = {}  # surface
@@ -258,7 +264,7 @@ class Recovery:
             failed |= {ray: k for ray, inside in zip(rays, valid, strict=True) if not inside and ray not in failed}
             if len(failed) == len(rays):
                 break
-        traced: dict = {}
+        traced: dict[int, Hits] = {}
         for place, ray in wanted:
             surface = failed.get(ray)
             if surface is None or is_posed(view.lens.surfaces[surface]):
@@ -266,21 +272,23 @@ class Recovery:
             before = self._before(view, state, rays, ray, surface, traced)
             yield place, _miss(state, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
 
-    def _bundle(self, view, last: int, rays: tuple[Ray, ...]) -> tuple[Bundle, np.ndarray]:
+    def _bundle(self, view: View, last: int, rays: tuple[Ray, ...]) -> tuple[Bundle, np.ndarray]:
         key = id(view), last, rays
         if key not in self._bundles:
             bundle = Bundle(view, last)
             self._bundles[key] = bundle, np.array([bundle.ask(*ray) for ray in rays])
         return self._bundles[key]
 
-    def _before(self, view, state: LensState, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict):
+    def _before(
+        self, view: View, state: LensState, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict[int, Hits]
+    ) -> tuple[Sequence[Number], Sequence[Number]]:
         """Position and direction of a ray before a surface, in the axes of its vertex; traced: all rays by surface."""
         number = rays.index(ray)
         if surface == 1:
             bundle, numbers = self._bundle(view, 1, rays)
             position, direction, *_ = bundle.launched(state)
-            at = int(bundle._places[0][numbers[number]])
-            flat = [part.reshape(-1)[at] for part in (*position, *direction)]
+            place = int(bundle._places[0][numbers[number]])
+            flat = [part.reshape(-1)[place] for part in (*position, *direction)]
             return flat[:3], flat[3:]
         bundle, numbers = self._bundle(view, surface - 1, rays)
         if surface not in traced:
@@ -290,7 +298,9 @@ class Recovery:
         return (x, y, z - state.thickness[surface - 1]), tuple(hit.direction[k][0] for k in range(3))
 
 
-def _miss(state: LensState, surface: int, wavelength: int, position, direction):
+def _miss(
+    state: LensState, surface: int, wavelength: int, position: Sequence[Number], direction: Sequence[Number]
+) -> Number:
     """The amount by which a ray misses a surface, or exceeds its critical angle."""
     (x, y, z), (L, M, N) = position, direction
     has_conic = (surface, "conic") in state.numbers or state.lens.surfaces[surface].conic is not None
@@ -317,11 +327,12 @@ RELATIONS = {"=": 0, "<=": 1, ">=": -1}
 class Expectation(Protocol):
     """The lens as built as a term of a merit function: `tolerancing.as_built.AsBuiltTerm`.
 
-    residuals: (R,) of a state of the lens, their derivatives (R, n), None without, and the number of failed rays; unit:
-    mm in the unit of length of the rows. expected, nominal: mean square spot radius () mm² as built and without errors.
+    residuals: (R,) of a state of the lens, their derivatives (R, n) by its variables, and the number of failed rays;
+    unit: mm in the unit of length of the rows. expected, nominal: mean square spot radius () mm² as built and without
+    errors.
     """
 
-    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray | None, int]: ...
+    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray, int]: ...
 
     def expected(self, lens: Lens) -> Tensor: ...
 
@@ -368,7 +379,7 @@ class Problem:
         UnknownOperand."""
         self.as_built = as_built
         held = tuple(_held(model.lens, rows, conditions))
-        self._settings = {"unit": unit, "skip_unknown": skip_unknown, "conventions": conventions}
+        self._settings: RowOptions = {"unit": unit, "skip_unknown": skip_unknown, "conventions": conventions}
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), **self._settings)
         weights = self.evaluation.weights
@@ -383,34 +394,33 @@ class Problem:
         self.recovery = Recovery(self.evaluation)
 
     def through(self, opening: float) -> "Problem":
-        """The same with rays through a part of the pupil and of the field alone, and without the lens as built."""
+        """The problem with rays through a part of pupil and field alone, and without the lens as built."""
         model = dataclasses.replace(self.model, opening=opening)
         return Problem(model, self.rows, self.conditions, **self._settings)
 
     def with_as_built(self, term: Expectation) -> "Problem":
-        """The same with the lens as built."""
+        """The problem with the lens as built as a term."""
         return Problem(self.model, self.rows, self.conditions, as_built=term, **self._settings)
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)
 
-    def state(self, x: np.ndarray, derivatives: bool) -> State:
+    def state(self, x: np.ndarray, derivatives: bool) -> SumOfSquares:
         """Residuals of rows of positive weight and of the lens as built, and violations of the other rows, in units of
         their rows."""
-        evaluated = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
+        evaluated = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x, derivatives)
         of_row, weights, residuals = evaluated.of_row, self.evaluation.weights, evaluated.residuals
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
         sides, count = evaluated.sides, len(x)
         rows, excess, slopes = np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, count))
         if sides:  # one-sided rows of all operands
-            rows, excess = (np.concatenate([one[k] for one in sides]) for k in range(2))
-            slopes = np.concatenate([np.zeros((len(one[1]), count)) if one[2] is None else one[2] for one in sides])
+            rows, excess, slopes = (np.concatenate([side[k] for side in sides]) for k in range(3))
         sided = np.isin(of_row, rows)
         squared, exact = (weights[of_row] > 0) & ~sided, (weights[of_row] < 0) & ~sided
         equal, limit = exact & (signs == 0), exact & (signs != 0)
         soft, hard = weights[rows] > 0, weights[rows] < 0
         of_hard = self.evaluation.factors[rows[hard]]
-        state = State(
+        state = SumOfSquares(
             x,
             residuals[squared],
             int(evaluated.lost[weights != 0].sum()),
@@ -420,9 +430,9 @@ class Problem:
         )
         added, by_variables, lost = self._as_built(x, derivatives)
         state = dataclasses.replace(state, residuals=np.concatenate([state.residuals, added]), lost=state.lost + lost)
-        jacobian = evaluated.jacobian
-        if jacobian is None:
+        if not derivatives:
             return state
+        jacobian = evaluated.jacobian
         of_limits = (signs[limit] / factors[limit])[:, None] * jacobian[limit], slopes[hard] / of_hard[:, None]
         return dataclasses.replace(
             state,
@@ -431,36 +441,36 @@ class Problem:
             limits_slope=np.concatenate(of_limits),
         )
 
-    def _as_built(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None, int]:
+    def _as_built(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray, int]:
         if self.as_built is None:
             return np.zeros(0), np.zeros((0, len(x))), 0
         view = self.model.views[self.model.lens.current_configuration - 1]
         state = view.state(Dual(x, np.eye(len(x))) if derivatives else x)
         residuals, slopes, lost = self.as_built.residuals(state, self.unit)
         factor = self._share**0.5
-        return factor * residuals, None if slopes is None else factor * slopes, lost
+        return factor * residuals, factor * slopes, lost
 
     @cached_property
     def _share(self) -> float:
-        """The part of the rows that are no boundaries in the sum of the weights."""
+        """The share of the rows without boundaries in the sum of the weights."""
         weights = np.maximum(self.evaluation.weights, 0.0)
         free = [not (row.operand in OPERANDS and OPERANDS[row.operand].bounds) for row in self.evaluation.rows]
         return float(weights[free].sum() / weights.sum())
 
-    def _charged(self, evaluated: Evaluated, x: np.ndarray) -> Evaluated:
-        """The charge for a failed ray raised the earlier it fails, and its miss as a further residual.
+    def _charged(self, evaluated: Evaluated, x: np.ndarray, derivatives: bool) -> Evaluated:
+        """The residuals with a charge for each failed ray, larger the earlier it fails, and its miss as a residual.
 
-        The former ranks two states; the latter alone has derivatives, which lead back.
+        The charge ranks two lenses; the miss has derivatives, which bring the ray back.
         """
         failed = evaluated.lost[evaluated.of_row]
         rows = np.unique(evaluated.of_row[failed])
         if not len(rows):
             return evaluated
-        missed, slopes, behind = self.recovery.excess(x, rows, derivatives=evaluated.jacobian is not None)
+        missed, slopes, behind = self.recovery.excess(x, rows, derivatives=derivatives)
         fixed = LOST * self.evaluation.factors[rows]
         residuals, jacobian = evaluated.residuals.copy(), evaluated.jacobian
         residuals[failed] *= 1 + behind[np.searchsorted(rows, evaluated.of_row[failed])]
-        if jacobian is not None:
+        if derivatives:
             jacobian = np.concatenate([jacobian, STEEP * fixed[:, None] * slopes])
         return dataclasses.replace(
             evaluated,
@@ -470,7 +480,7 @@ class Problem:
         )
 
     def merit(self, evaluated: Evaluated, x: np.ndarray | None = None) -> float:
-        """M over the rows of the merit function alone; with x and the lens as built in addition."""
+        """M over the rows of the merit function; with x, the lens as built is added."""
         residuals = evaluated.residuals[evaluated.of_row < len(self.rows)]
         added = self._as_built(x, False)[0] if x is not None else np.zeros(0)
         return float(np.sqrt(residuals @ residuals + added @ added))
@@ -484,10 +494,11 @@ class FunctionMerit:
     """
 
     def __init__(
-        self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()
+        self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Iterable[np.ndarray] = ()
     ):
-        self.model, self.function, self.evaluations, self.evaluated = model, function, 0, [*evaluated]
-        self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
+        self.model, self.function, self.evaluations = model, function, 0
+        self.evaluated: list[np.ndarray] = [*evaluated]
+        self.known = {evaluation[: len(evaluation) // 2].tobytes(): evaluation for evaluation in self.evaluated}
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """The merit and its gradient (n,)."""
@@ -517,19 +528,20 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
     where the merit function or a condition does."""
     if any(row.operand == "PRIM" for row in rows):
         yield Row("PRIM", (0, lens.primary_wavelength)), 0
-    several = any(row.operand == "CONF" for row in rows) or any(one.configuration for one in conditions)
-    for one in conditions:
+    several = any(row.operand == "CONF" for row in rows) or any(condition.configuration for condition in conditions)
+    for condition in conditions:
         if several:
-            yield Row("CONF", (one.configuration or lens.current_configuration, 0)), 0
-        yield dataclasses.replace(one.row, weight=-1.0), RELATIONS[one.relation]
+            yield Row("CONF", (condition.configuration or lens.current_configuration, 0)), 0
+        yield dataclasses.replace(condition.row, weight=-1.0), RELATIONS[condition.relation]
 
 
 def typical_of(model: DesignVariables) -> np.ndarray:
-    """Large changes (n,) of the variables: for beams h wide h in thickness, 1/10h in curvature; or inf."""
+    """Large changes (n,) of the variables: h of thicknesses, 0.1/h of curvatures, h the radius of the beam; inf if
+    unknown."""
     state = model.views[model.lens.current_configuration - 1].state(model.start)
     h = 0.5 * float(state.entrance_pupil_diameter)
     typical = {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}
-    names = [one.quantity for one in model.variables]
+    names = [variable.quantity for variable in model.variables]
     return np.array(
         [
             0.01 * h ** (1 - int(name[1:])) if name[0] == "a" and name[1:].isdigit() else typical.get(name, np.inf)

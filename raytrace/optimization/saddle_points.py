@@ -18,13 +18,13 @@ Opt. Express 17, 2009.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import null_space
 
 from raytrace.materials.glass import is_air
-from raytrace.optimization.least_squares import SolverOptions, State
+from raytrace.optimization.least_squares import SolverOptions, SumOfSquares
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem
@@ -47,31 +47,31 @@ from raytrace.system.surface import is_posed
 from raytrace.words import option
 
 _SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
-_NEAR = 0.01  # of the residuals: by how much a step along a variable changes them, for second derivatives
+_NEAR = 0.01  # relative change of the residuals by a step along a variable, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
 # -- surfaces for a meniscus -------------------------------------------------------------------------------------------
 
 
-def surfaces_of(free: DesignVariables, named: Sequence[int] = ()) -> tuple[int, ...]:
-    """The surfaces that take a meniscus, or those that are named. Raises NoProblem."""
+def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[int, ...]:
+    """All surfaces before which a meniscus can be inserted, or the given ones, checked. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
         raise NoProblem(f"{option('insert')}: the lens has several configurations; take one of them")
-    if not named:
-        found = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
-        if not found:
+    if not surfaces:
+        surfaces = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
+        if not surfaces:
             raise NoProblem(f"{option('insert')}: no spherical surface between glass and air whose curvature varies")
-        return found
-    for k in named:
+        return surfaces
+    for k in surfaces:
         if objection := _objection(free, k):
             raise NoProblem(f"{option('insert')}: surface {k} {objection}")
-    return tuple(dict.fromkeys(named))
+    return tuple(dict.fromkeys(surfaces))
 
 
 def _objection(free: DesignVariables, k: int) -> str:
-    """Why a surface takes no meniscus, "" where it does."""
+    """The reason why no meniscus can be inserted before a surface, "" where it can."""
     lens = free.lens
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
@@ -81,7 +81,7 @@ def _objection(free: DesignVariables, k: int) -> str:
         return "is not a centred refracting sphere"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
         return "is not between glass and air"
-    varies = any((one.surface, one.quantity) == (k, "curvature") for one in free.variables)
+    varies = any(variable.address == (k, "curvature") for variable in free.variables)
     return "" if varies else f"has a curvature that does not vary: name it by {option('vary')}"
 
 
@@ -92,15 +92,15 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
     made, free = with_meniscus(lens, k), task.model
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
-    old = [_moved(one, k) for one in free.variables]
-    own = {one: ends for one, *ends in zip(old, *task.bounds, strict=True)}
-    steep = own[next(one for one in old if (one.surface, one.quantity) == (k + 2, "curvature"))]
-    own |= {one: steep if one.quantity == "curvature" else (-np.inf, np.inf) for one in new}
-    quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
-    variables = tuple(sorted(own, key=lambda one: (quantities.index(one.quantity), one.surface)))
-    solves = tuple(_moved(one, k) for one in free.solves)
+    old = [replace(variable, surface=_behind(variable.surface, k)) for variable in free.variables]
+    bounds = {variable: (least, most) for variable, least, most in zip(old, *task.bounds, strict=True)}
+    steep = bounds[next(variable for variable in old if variable.address == (k + 2, "curvature"))]
+    bounds |= {variable: steep if variable.quantity == "curvature" else (-np.inf, np.inf) for variable in new}
+    quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *old)))
+    variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
+    solves = tuple(_moved(solve, k) for solve in free.solves)
     if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
-        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(one, k) for one in data.kept)
+        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(solve, k) for solve in data.kept)
         diameters = tuple(_behind(surface, k) for surface in data.semi_diameters)
         data = replace(data, variables=variables, solves=solves, merit=merit, semi_diameters=diameters, kept=kept)
         made = replace(made, optimization_data=replace(data, tolerances=()))
@@ -108,24 +108,29 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
         task,
         model=DesignVariables(made, variables, solves),
         rows=tuple(_row(row, k) for row in task.rows),
-        conditions=tuple(replace(one, row=_row(one.row, k)) for one in task.conditions),
-        bounds=tuple(np.array([own[one][side] for one in variables], dtype=float) for side in range(2)),
+        conditions=tuple(replace(condition, row=_row(condition.row, k)) for condition in task.conditions),
+        bounds=(
+            np.array([bounds[variable][0] for variable in variables], dtype=float),
+            np.array([bounds[variable][1] for variable in variables], dtype=float),
+        ),
     )
 
 
 def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
-    """The rows with that part of the least thicknesses task of the new gaps, of 0 none; as many rows ahead of those
-    that are split off."""
+    """The rows with a part of the least thicknesses of the new gaps, without them if `part` is 0.
+
+    Rows that are split off come last.
+    """
     pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
-    return (*(one[0] for one in pieces), *(row for one in pieces for row in one[1:]))
+    return (*(piece[0] for piece in pieces), *(row for piece in pieces for row in piece[1:]))
 
 
 def with_meniscus(lens: Lens, k: int) -> Lens:
     """The lens with a meniscus without thickness before surface k, of the adjacent glass; no ray changes."""
     surface = lens.surfaces[k]
-    common = {"thickness": 0 * surface.thickness, "apertures": (), "comment": ""}
+    thin = replace(surface, thickness=0 * surface.thickness, apertures=(), comment="")
     media = (surface, lens.surfaces[k - 1])  # behind the two new surfaces
-    new = [replace(surface, glass=medium.glass, environment=medium.environment, **common) for medium in media]
+    new = [replace(thin, glass=medium.glass, environment=medium.environment) for medium in media]
     stop = lens.stop + 2 if lens.stop >= k else lens.stop
     return replace(lens, surfaces=(*lens.surfaces[:k], *new, *lens.surfaces[k:]), stop=stop)
 
@@ -135,9 +140,8 @@ def _behind(surface: int, k: int) -> int:
     return surface + 2 if surface >= k else surface
 
 
-def _moved(one: Vary | Solve, k: int) -> Vary | Solve:
-    further = {"source": _behind(one.source, k)} if isinstance(one, Solve) else {}
-    return replace(one, surface=_behind(one.surface, k), **further)
+def _moved(solve: Solve, k: int) -> Solve:
+    return replace(solve, surface=_behind(solve.surface, k), source=_behind(solve.source, k))
 
 
 def _row(row: Row, k: int) -> Row:
@@ -146,8 +150,8 @@ def _row(row: Row, k: int) -> Row:
         kinds = ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
     else:
         kinds = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    moved = [_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True)]
-    return replace(row, integers=tuple(moved)) if any(kinds) else row
+    first, second = (_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True))
+    return replace(row, integers=(first, second)) if any(kinds) else row
 
 
 def _split(row: Row, k: int, part: float) -> list[Row]:
@@ -157,10 +161,10 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
     if not is_least or last < k or first > k + 1:
         return [row]
     ranges = [(first, k - 1), (max(first, k + 2), last)]
-    found = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
+    rows = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
     if part > 0:
-        found.append(replace(row, integers=(k, k + 1), target=part * row.target))
-    return found or [replace(row, weight=0.0)]
+        rows.append(replace(row, integers=(k, k + 1), target=part * row.target))
+    return rows or [replace(row, weight=0.0)]
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------
@@ -168,8 +172,11 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
 
 @dataclass(frozen=True)
 class Saddle:
-    """How the merit curves under its conditions. ways (n, m): a basis of the steps that break none, each of which
-    changes the residuals alike; slope (m,) and curves (m, m) of half the square of the merit along them."""
+    """Second order of the merit under its conditions.
+
+    ways (n, m): a basis of the steps that keep the conditions, each of which changes the residuals by the same amount;
+    slope (m,) and curves (m, m) of half the square of the merit along them.
+    """
 
     ways: np.ndarray
     slope: np.ndarray
@@ -177,12 +184,12 @@ class Saddle:
 
     @property
     def descent(self) -> np.ndarray:
-        """(n,) the way along which it falls most, to both sides."""
+        """The direction (n,) along which the merit falls most, to both sides."""
         return self.ways @ np.linalg.eigh(self.curves)[1][:, 0]
 
 
 def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
-    """How the merit curves at x (n,) where the variables `moves` (n,) move."""
+    """Second order of the merit at x (n,), by the variables `moves` (n,)."""
     state = problem.state(x, True)
     columns = np.sqrt((state.jacobian**2).sum(0))
     scale = np.where(columns > 0, columns, 1.0)
@@ -201,7 +208,7 @@ def saddle(problem: Problem, x: np.ndarray, moves: np.ndarray) -> Saddle:
     return Saddle(ways, ways.T @ gradient(state), 0.5 * along.T @ (second + second.T) @ along)
 
 
-def _slope(state: State) -> np.ndarray:
+def _slope(state: SumOfSquares) -> np.ndarray:
     """Half the gradient (n,) of the sum of squares."""
     sides = state.sides
     over = sides.excess > 0
@@ -209,8 +216,8 @@ def _slope(state: State) -> np.ndarray:
     return state.jacobian.T @ state.residuals + sums[sides.row[over]] @ sides.slope[over]
 
 
-def _conditions(state: State, like: State | None = None) -> np.ndarray:
-    """Slopes (h, n) of what is held and of the limits that are reached, at the state `like`."""
+def _conditions(state: SumOfSquares, like: SumOfSquares | None = None) -> np.ndarray:
+    """Slopes (h, n) of the equalities and of the limits that are active at the state `like`."""
     reached = (like or state).limits > -_ACTIVE
     return np.concatenate([state.held_slope, state.limits_slope[reached]])
 
@@ -231,9 +238,11 @@ class Place:
     task: SearchProblem
 
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
-        """With that part of the least thicknesses; with none of it the new gaps stay at 0."""
+        """The descent with a part of the least thicknesses; with a part of 0 the new gaps stay at 0."""
         space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
-        gaps = np.array([one.quantity == "thickness" and one.surface in new for one in self.task.model.variables])
+        gaps = np.array(
+            [variable.quantity == "thickness" and variable.surface in new for variable in self.task.model.variables]
+        )
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
         problem = self.task.problem(thinned(self.task.rows, self.k, part))
@@ -241,10 +250,10 @@ class Place:
 
     @property
     def family(self) -> tuple:
-        """What lenses have in common whose variables can be compared."""
+        """Media, stop and variables: minima of lenses with the same ones can be compared."""
         lens = self.task.model.lens
-        variables = tuple((one.surface, one.quantity) for one in self.task.model.variables)
-        media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
+        variables = tuple(variable.address for variable in self.task.model.variables)
+        media = tuple((surface.glass.name, *surface.glass.coefficients.tolist()) for surface in lens.surfaces)
         return media, lens.stop, variables
 
     def gone(self, sign: float, until: float = np.inf) -> TaskResult:
@@ -255,7 +264,7 @@ class Place:
         return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
 
     def displaced(self, stage: Stage, sign: float) -> np.ndarray:
-        """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
+        """Variables (n,) off the saddle to one side, as far as the merit falls, with the conditions met again."""
         x, problem = self.task.model.start, stage.problem
         way = saddle(problem, x, stage.moves(x)).descent
         way = sign * way / np.abs(way[np.argmax(np.abs(way))]) * np.sign(way[np.argmax(np.abs(way))])
@@ -263,15 +272,15 @@ class Place:
         unit = np.sqrt(problem.state(x, False).cost) / np.linalg.norm(columns * way)
         best, least = x + _OFF[0] * unit * way, np.inf
         for size in _OFF:
-            there = self._met(stage, x + size * unit * way)
-            state = problem.state(there, False)
+            trial = self._met(stage, x + size * unit * way)
+            state = problem.state(trial, False)
             if not state.is_finite or state.lost or state.cost >= least:
                 break
-            best, least = there, state.cost
+            best, least = trial, state.cost
         return best
 
     def _met(self, stage: Stage, x: np.ndarray) -> np.ndarray:
-        """x with what is held met, by the shortest steps."""
+        """x with the equalities met, by the shortest steps."""
         x = np.clip(x, stage.lower, stage.upper)
         moves = stage.moves(x)
         for _ in range(_MEETINGS):
@@ -294,7 +303,7 @@ class Insertion:
     task: SearchProblem
     journal: Journal
     places: Sequence[int]
-    found: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
+    families: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
     started: int = 0  # descents
 
     DONE: ClassVar[str] = "surfaces"
@@ -309,12 +318,13 @@ class Insertion:
         model, space = self.task.model, self.task.space
         stage = Stage(self.task.whole, LONG, FOLLOW, space.lower, space.upper)
         until = self.journal.until
-        own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
-        if not own.is_valid:
+        of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
+        if not of_lens.is_valid:
             raise NoProblem(
-                f"{option('insert')}: the lens itself loses rays or misses what is held; search without insert first"
+                f"{option('insert')}: the lens itself loses rays or violates {option('hold')}; search without insert "
+                "first"
             )
-        lens, work = model.lens_at(own.x), own.seconds
+        lens, work = model.lens_at(of_lens.x), of_lens.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:
             for k in self.places:
@@ -323,7 +333,7 @@ class Insertion:
             if bar is not None:
                 bar.close()
 
-    def _both(self, place: Place, work: float, bar) -> float:
+    def _both(self, place: Place, work: float, bar: Any) -> float:
         """The two sides of a saddle; the seconds that they took."""
         tasks = [
             (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))
@@ -332,7 +342,7 @@ class Insertion:
         space = place.task.space
         ends = self.journal.each(tasks, len(space.lower))
         ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.found.setdefault(place.family, (place.task.whole, Minima(ranges)))
+        _, minima = self.families.setdefault(place.family, (place.task.whole, Minima(ranges)))
         for (key, _), end in zip(tasks, ends, strict=True):
             work += end.seconds
             minima.add(end, key, work)
@@ -344,6 +354,6 @@ class Insertion:
         return sum(end.seconds for end in ends)
 
     def each(self) -> list[tuple[Problem, Minimum]]:
-        """All minima, the best first, each with the problem that it is one of."""
-        found = [(problem, one) for problem, minima in self.found.values() for one in minima.each]
-        return sorted(found, key=lambda pair: pair[1].result.merit)
+        """All minima, the best first, each with its problem."""
+        minima = [(problem, minimum) for problem, distinct in self.families.values() for minimum in distinct.each]
+        return sorted(minima, key=lambda pair: pair[1].result.merit)

@@ -9,10 +9,11 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,9 +25,12 @@ from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table
+from raytrace.optimization.attained import conditions_attained
+from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
-from raytrace.optimization.optimize import conditions_at, drawn_fields, opened, refuse_contradictions
+from raytrace.optimization.opening import opened
+from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
     Condition,
     ExpectationSettings,
@@ -60,6 +64,10 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level, option
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 #: Why a search ends.
 STOPPED = {
     "starts": "all starts were tried",
@@ -77,11 +85,11 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; found: number of followed descents to it; after: processor seconds until the first; tasks: key of that
-    one. variables: (M, n). starts, descents: numbers of starts, and of descents that were followed to their end.
-    as_built: (M, 3) the merit with the lens as built, by which the minima then are ordered, nan where a perturbed lens
-    fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused lens without errors;
-    tolerances: of which errors.
+    weights; times_reached: number of followed descents to it, the column `found`; after: processor seconds until the
+    first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of descents that were
+    followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are ordered, nan
+    where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused
+    lens without errors; tolerances: of which errors.
     """
 
     before: Lens
@@ -92,7 +100,7 @@ class Searched(Result):
     merit: Tensor
     focal_length: Tensor
     spots: Tensor
-    found: Tensor
+    times_reached: Tensor
     after: Tensor
     starts: int
     descents: int
@@ -100,6 +108,11 @@ class Searched(Result):
     stopped: str
     as_built: Tensor | None = None
     tolerances: str = ""
+
+    @property
+    def found(self) -> Tensor:
+        """`times_reached`, by its former name."""
+        return self.times_reached
 
     @property
     def lens(self) -> Lens:
@@ -114,7 +127,7 @@ class Searched(Result):
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             of_lens |= {"merit_as_built": merit, "expected_um": 1e3 * expected, "refocused_um": 1e3 * nominal}
-        return {**of_lens, "found": self.found, "seconds": self.after, **variables}
+        return {**of_lens, "found": self.times_reached, "seconds": self.after, **variables}
 
     def document(self) -> dict:
         counts = {"starts": self.starts, "descents": self.descents, "seconds": round(self.seconds, 3)}
@@ -141,11 +154,11 @@ class Searched(Result):
             shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
             shown |= {Column("expected", "µm", ".2f", "RMS\nas built"): 1e3 * expected}
             shown |= {Column("refocused", "µm", ".2f", "RMS\nno errors"): 1e3 * nominal}
-        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.found}
+        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.times_reached}
         return [Table(shown, title)]
 
     @style.styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """The best lenses on one scale, each with its merit, its spots and how many descents reached it."""
         count = min(_MOST, len(self.lenses))
         columns = min(_COLUMNS, count)
@@ -169,7 +182,7 @@ class Searched(Result):
         folder.mkdir(parents=True, exist_ok=True)
         for number, lens in enumerate(self.lenses, 1):
             with warnings.catch_warnings():
-                if number > 1:  # what a file cannot hold is the same of all
+                if number > 1:  # the same warnings for every minimum
                     warnings.simplefilter("ignore", LensFileWarning)
                 write_lens(lens, folder / f"minimum_{number:02d}.zmx")
             thumbnail(lens, folder / f"minimum_{number:02d}.png")
@@ -197,13 +210,13 @@ def searched(
     """The result: minima, the best first, each with its problem."""
     terms: list[tuple[float, float, float]] = []
     if as_built is not None:
-        terms = [_as_built(problem, one, as_built) for problem, one in each[:MOST]]
+        terms = [_as_built(problem, minimum, as_built) for problem, minimum in each[:MOST]]
         order = sorted(range(len(terms)), key=lambda k: (np.isnan(terms[k][0]), terms[k][0]))
         each, terms = [each[k] for k in order], [terms[k] for k in order]
     minima, lenses, tables = each[:MOST], [], []
-    for k, (problem, one) in enumerate(minima, 1):
-        variables = zip(problem.model.variables, one.result.x, strict=True)
-        lenses.append(_design(problem, one.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
+    for k, (problem, minimum) in enumerate(minima, 1):
+        variables = zip(problem.model.variables, minimum.result.x, strict=True)
+        lenses.append(_design(problem, minimum.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
         tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
     names = tuple(dict.fromkeys(name for table in tables for name in table))
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
@@ -211,19 +224,21 @@ def searched(
         before=lens,
         lenses=tuple(lenses),
         names=names,
-        tasks=tuple(one.task for _, one in minima),
+        tasks=tuple(minimum.task for _, minimum in minima),
         variables=tensor([[table.get(name, np.nan) for name in names] for table in tables]),
-        merit=tensor([one.result.merit for _, one in minima]),
-        focal_length=torch.stack([first_order(one).effective_focal_length.reshape(()) for one in lenses]),
-        spots=torch.stack([_spots(one) for one in lenses]),
-        found=torch.tensor([one.found for _, one in minima]),
-        after=tensor([one.seconds for _, one in minima]),
+        merit=tensor([minimum.result.merit for _, minimum in minima]),
+        focal_length=torch.stack(
+            [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
+        ),
+        spots=torch.stack([_spots(lens_of_minimum) for lens_of_minimum in lenses]),
+        times_reached=torch.tensor([minimum.descents for _, minimum in minima]),
+        after=tensor([minimum.seconds for _, minimum in minima]),
         starts=starts,
         descents=descents,
         stopped=stopped,
         seconds=seconds,
         as_built=tensor(terms) if terms else None,
-        tolerances=as_built.words() if terms else "",
+        tolerances=as_built.words() if as_built is not None and terms else "",
     )
 
 
@@ -233,9 +248,10 @@ def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: 
     ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
     if ends:
         nearest = min(ends, key=lambda end: end.rank)
-        missed = [one for one in conditions_at(task.whole, nearest.x) if not one.met]
+        conditions = conditions_attained(task.whole, task.whole.evaluated(nearest.x))
+        missed = [condition for condition in conditions if not condition.met]
         rays = [f"failing rays in {nearest.lost:g} rows"] if nearest.lost else []
-        words = ", ".join([*rays, *(f"{one.words} at {one.reached:.6g}" for one in missed)])
+        words = ", ".join([*rays, *(f"{condition.words} at {condition.reached:.6g}" for condition in missed)])
         place = ""
         if folder is not None:
             path = Path(folder) / NEAREST
@@ -255,10 +271,10 @@ def _design(problem: Problem, x: np.ndarray, name: str) -> Lens:
     return replace(design, name=name, optimization_data=data)
 
 
-def _as_built(problem: Problem, one: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
+def _as_built(problem: Problem, minimum: Minimum, settings: ExpectationSettings) -> tuple[float, float, float]:
     """The merit with the lens as built, and the RMS spot radius in mm expected and without errors, nan where a
     perturbed lens fails; the tolerances are those of the lens of the minimum."""
-    lens, x = problem.model.lens_at(one.result.x), one.result.x
+    lens, x = problem.model.lens_at(minimum.result.x), minimum.result.x
     try:
         term = settings.of(lens)
     except NoLight:
@@ -278,24 +294,24 @@ def _spots(lens: Lens) -> Tensor:
     return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
 
 
-def _draw(axes, found: Searched, k: int) -> None:
-    _draw_lens(axes, found.lenses[k])
-    spots = ", ".join(f"{1e3 * float(one):.1f}" for one in found.spots[k])
-    times = int(found.found[k])
+def _draw(axes: "Axes", result: Searched, k: int) -> None:
+    _draw_lens(axes, result.lenses[k])
+    spots = ", ".join(f"{1e3 * float(radius):.1f}" for radius in result.spots[k])
+    times = int(result.times_reached[k])
     axes.set_title(
-        f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
-        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
+        f"{k + 1}: merit {style.number_text(float(result.merit[k]))}\n"
+        f"RMS spots {spots} µm; found by {times} of {result.descents} descents", fontsize=8,
     )  # fmt: skip
 
 
-def _draw_lens(axes, lens: Lens) -> None:
+def _draw_lens(axes: "Axes", lens: Lens) -> None:
     lens = detached(lens)
     draw_layout(axes, lens, fields=drawn_fields(lens), rays=3)
 
 
 @style.styled
 def thumbnail(lens: Lens, path: str | PathLike) -> None:
-    """Write the cross section alone, small."""
+    """Write a small figure of the cross section."""
     figure = style.new_figure(3.0, 1.8)
     _draw_lens(figure.add_subplot(), lens)
     style.save(figure, path, dpi=80)
@@ -355,17 +371,16 @@ def search(
     started = time.monotonic()
     function = merit_for(lens, merit)
     free = design_variables(lens, vary)
-    if any(one.quantity == "glass" for one in free.variables):
+    if any(variable.quantity == "glass" for variable in free.variables):
         raise NoProblem(
             f"{option('vary', 'glass')} is for optimize: search with the glasses as they are, then optimize what is "
             "found"
         )
     glass, air = function.boundaries.glass, function.boundaries.air
     ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
-    settings = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    task = SearchProblem(free, tuple(function.rows), conditions, ends, glass, air, settings)
+    task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
     until = started + (np.inf if seconds is None else seconds)
-    surfaces = ()
+    surfaces: tuple[int, ...] = ()
     if insert is not None and insert is not False:
         if starts is not None:
             raise NoProblem(
@@ -376,6 +391,7 @@ def search(
     if conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
+    run: Insertion | _Run
     if surfaces:
         run = Insertion(task, Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until), surfaces)
     else:
@@ -415,7 +431,7 @@ class _Run:
 
     DONE: ClassVar[str] = "starts"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         pupil, field = _NARROW  # the rays of default merit functions nearer to the axis
         scale = np.array([field, field, pupil, pupil])
         rows = [
@@ -428,10 +444,10 @@ class _Run:
 
     def each(self) -> list[tuple[Problem, Minimum]]:
         """All minima, the best first, each with its problem."""
-        return [(self.whole, one) for one in self.minima.each]
+        return [(self.whole, minimum) for minimum in self.minima.each]
 
     def through(self, progress: Callable | None) -> None:
-        """All batches. Raises SearchStopped."""
+        """Run all batches. Raises SearchStopped."""
         bar = None if progress is None else progress(self.starts, "start")
         try:
             first = [_FIRST] if self.starts > _BATCH else []
@@ -441,7 +457,7 @@ class _Run:
             if bar is not None:
                 bar.close()
 
-    def _batch(self, numbers: range, bar) -> None:
+    def _batch(self, numbers: range, bar: Any) -> None:
         def start(number: int) -> TaskResult:
             result = self._start(number)
             if bar is not None:
@@ -449,7 +465,7 @@ class _Run:
             return result
 
         keys = [f"start {i}" for i in numbers]
-        ends = self._results([(key, lambda i=i: start(i)) for key, i in zip(keys, numbers, strict=True)])
+        ends = self._results([(key, partial(start, i)) for key, i in zip(keys, numbers, strict=True)])
         self.started = numbers.stop
         best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
         self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
@@ -457,14 +473,14 @@ class _Run:
         hops = [(f"hop {numbers[0] + k}", springs[k % len(springs)].result.x) for k in range(_HOPS)] if springs else []
         self._follow([(key, self._hopped(key, x)) for key, x in hops], bar)
 
-    def _results(self, tasks) -> list[TaskResult]:
+    def _results(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]]) -> list[TaskResult]:
         ends = self.journal.each(tasks, len(self.space.lower))
         self.work += sum(end.seconds for end in ends)
         return ends
 
-    def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
+    def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar: Any) -> None:
         stages = [Stage(self.whole, LONG, FOLLOW, *self.bounds)]
-        ends = self._results([(key, lambda x=x: descended(x, stages, self.journal.until)) for key, x in tasks])
+        ends = self._results([(key, partial(descended, x, stages, self.journal.until)) for key, x in tasks])
         self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:
@@ -474,16 +490,17 @@ class _Run:
         """The lens as it is, or the best of some points between the bounds; both descended a little."""
         start = self.task.model.start
         points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(start, *self.bounds)[None]
-        best, worth = None, (np.inf, np.inf)  # failed rays and squares on the narrow beam
-        for x in map(self.space.prepared, points):
+
+        def rank(x: np.ndarray) -> tuple[float, float]:
+            """Failed rays and sum of squares on the narrow beam."""
             with np.errstate(all="ignore"):
                 evaluated = self.narrow.evaluated(x)
-            rank = float(evaluated.lost.sum()), float(np.nansum(evaluated.residuals**2))
-            if best is None or rank < worth:
-                best, worth = x, rank
-        if worth[0]:
-            bounds = {"lower": self.space.lower, "upper": self.space.upper}
-            best, _, interrupted = opened(self.whole, best, until=self.journal.until, **bounds)
+            return float(evaluated.lost.sum()), float(np.nansum(evaluated.residuals**2))
+
+        (lost, _), best = min(((rank(x), x) for x in map(self.space.prepared, points)), key=lambda pair: pair[0])
+        if lost:
+            lower, upper = self.space.lower, self.space.upper
+            best, _, interrupted = opened(self.whole, best, lower=lower, upper=upper, until=self.journal.until)
             if interrupted or time.monotonic() > self.journal.until:
                 raise SearchStopped
         stages = [
@@ -500,14 +517,16 @@ class _Run:
 
 
 def _reversal(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
-    """The variable that each becomes in the reversed lens, and its sign; None where the reversal has others."""
+    """The variable that each becomes in the reversed lens, and its sign; None if the reversed lens has other ones."""
     lens = space.model.lens
     if not np.isfinite(float(lens.surfaces[0].thickness)):
         return None
     variables, last = space.model.variables, len(lens.surfaces) - 2
-    at = {(one.surface, one.quantity): k for k, one in enumerate(variables)}
+    columns = {variable.address: k for k, variable in enumerate(variables)}
     partner = {"curvature": lambda k: last + 1 - k, "thickness": lambda k: last - k}
-    other = [(partner.get(one.quantity, lambda k: -1)(one.surface), one.quantity) for one in variables]
-    if any(address not in at for address in other):
+    other = [
+        (partner.get(variable.quantity, lambda k: -1)(variable.surface), variable.quantity) for variable in variables
+    ]
+    if any(address not in columns for address in other):
         return None
-    return np.array([at[address] for address in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)
+    return np.array([columns[address] for address in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)

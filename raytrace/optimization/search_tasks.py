@@ -24,6 +24,7 @@ from scipy.stats import qmc
 
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
+from raytrace.optimization.merit import RowOptions
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, name_of
 from raytrace.shards import agreeing, share, total
@@ -87,11 +88,13 @@ class Journal:
 
         Raises BadSearch.
         """
-        self.until, self.known, self.lines = until, {}, {}
+        self.until = until
+        self.known: dict[str, TaskResult] = {}
+        self.lines: dict[str, int] = {}
         self.store = Records(None if folder is None else Path(folder) / FILE, about, _JOURNAL, _TASK)
         for line, result in self.store.read():
-            numbers = (result[name] for name in TaskResult._fields[:4])
-            self.known[result["task"]] = TaskResult(*numbers, np.array(result["x"]))
+            numbers = {name: result[name] for name in TaskResult._fields[:4]}
+            self.known[result["task"]] = TaskResult(**numbers, x=np.array(result["x"]))
             self.lines[result["task"]] = line
 
     def each(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]], count: int) -> list[TaskResult]:
@@ -122,7 +125,8 @@ class Journal:
         if mine.processes > 1:
             for (key, _), row in zip(left, total(table), strict=True):
                 if row[0]:
-                    self._add(key, TaskResult(*row[1:5].tolist(), row[5:].numpy()))
+                    lost, missed, merit, seconds = row[1:5].tolist()
+                    self._add(key, TaskResult(lost, missed, merit, seconds, row[5:].numpy()))
         if stopped or any(key not in self.known for key, _ in tasks):
             raise SearchStopped
         return [self.known[key] for key, _ in tasks]
@@ -146,7 +150,7 @@ class Minimum:
     result: TaskResult
     task: str
     seconds: float
-    found: int = 1
+    descents: int = 1
 
 
 @dataclass
@@ -159,28 +163,28 @@ class Minima:
     each: list[Minimum] = field(default_factory=list)
 
     def add(self, result: TaskResult, task: str, seconds: float) -> bool:
-        """Whether it is new, or better than the minimum that it equals."""
+        """Add a result; whether it is new, or better than the minimum that it equals."""
         if not result.is_valid:
             return False
-        same = next((one for one in self.each if self._is_same(one.result, result)), None)
+        same = next((minimum for minimum in self.each if self._is_same(minimum.result, result)), None)
         better = same is None or result.merit < same.result.merit * (1 - 1e-6)
         if same is None:
             self.each.append(Minimum(result, task, seconds))
         else:
-            same.found += 1
+            same.descents += 1
             if better:
                 same.result, same.task, same.seconds = result, task, seconds
-        self.each.sort(key=lambda one: one.result.merit)
+        self.each.sort(key=lambda minimum: minimum.result.merit)
         return better
 
-    def _is_same(self, one: TaskResult, other: TaskResult) -> bool:
-        if abs(one.merit - other.merit) > _EQUAL * max(one.merit, other.merit):
+    def _is_same(self, result: TaskResult, other: TaskResult) -> bool:
+        if abs(result.merit - other.merit) > _EQUAL * max(result.merit, other.merit):
             return False
         designs = [other.x]
         if self.reversal is not None:
             indices, signs = self.reversal
             designs.append(signs * other.x[indices])
-        return any(np.abs((one.x - x) / self.ranges).max() < _ALIKE for x in designs)
+        return any(np.abs((result.x - x) / self.ranges).max() < _ALIKE for x in designs)
 
 
 # -- bounds and starts -------------------------------------------------------------------------------------------------
@@ -218,9 +222,9 @@ class Space:
         """x with its curvatures scaled to the focal length and the sensor at the paraxial focus, within bounds."""
         x = np.clip(x, self.lower, self.upper)
         if self.focal_length is not None:
-            x = np.clip(self._focused(x), self.lower, self.upper)
+            x = np.clip(self._focused(x, self.focal_length), self.lower, self.upper)
         last = sensor(self.model.lens), "thickness"
-        of_sensor = [k for k, one in enumerate(self.model.variables) if (one.surface, one.quantity) == last]
+        of_sensor = [k for k, variable in enumerate(self.model.variables) if variable.address == last]
         if of_sensor:
             state = self._state(x)
             data = state.gaussian(state.primary)
@@ -233,29 +237,30 @@ class Space:
     def _state(self, x: np.ndarray) -> LensState:
         return self.model.views[self.model.lens.current_configuration - 1].state(x)
 
-    def _excess(self, x: np.ndarray) -> float:
-        """Power beyond that of the focal length, in its units."""
-        state = self._state(x)
-        data = state.gaussian(state.primary)
-        return float(-data.C / abs(data.n_image) * self.focal_length - 1)
+    def _focused(self, x: np.ndarray, focal_length: float) -> np.ndarray:
+        """x for a focal length: with all curvatures scaled by a factor, or else with the last curvature changed."""
 
-    def _focused(self, x: np.ndarray) -> np.ndarray:
-        """With all curvatures scaled by one number, or else with the last one changed."""
-        curved = np.array([one.quantity == "curvature" for one in self.model.variables])
+        def excess(x: np.ndarray) -> float:
+            """Power beyond that of the focal length, in its units."""
+            state = self._state(x)
+            data = state.gaussian(state.primary)
+            return float(-data.C / abs(data.n_image) * focal_length - 1)
+
+        curved = np.array([variable.quantity == "curvature" for variable in self.model.variables])
         if not curved.any():
             return x
         scaled = lambda s: np.where(curved, s * x, x)  # noqa: E731
-        at = _root(lambda s: self._excess(scaled(s)), _FACTORS, lambda s: abs(np.log(abs(s))))
-        if at is not None:
-            return scaled(at)
+        factor = _root(lambda s: excess(scaled(s)), _FACTORS, lambda s: abs(np.log(abs(s))))
+        if factor is not None:
+            return scaled(factor)
         last = np.nonzero(curved)[0][-1]
         moved = lambda c: np.where(np.arange(len(x)) == last, c, x)  # noqa: E731
         steps = np.linspace(self.lower[last], self.upper[last], 24)
-        at = _root(lambda c: self._excess(moved(c)), steps, abs)
-        return x if at is None else moved(at)
+        last_curvature = _root(lambda c: excess(moved(c)), steps, abs)
+        return x if last_curvature is None else moved(last_curvature)
 
 
-def _root(function: Callable, points: np.ndarray, distance: Callable) -> float | None:
+def _root(function: Callable[[float], float], points: np.ndarray, distance: Callable[[float], float]) -> float | None:
     """The root of least distance between neighbouring points within a factor; None without any."""
     values = np.array([function(point) for point in points])
     turns = np.nonzero(values[:-1] * values[1:] < 0)[0]
@@ -281,17 +286,18 @@ def space_of(
 
     glass, air: ranges of thicknesses, mm. Raises NoProblem where bounds are needed and no length is known.
     """
-    ends = [_ends(model, one, length, glass, air) for one in model.variables]
+    ends = [_ends(model, variable, length, glass, air) for variable in model.variables]
     lower = np.where(np.isfinite(bounds[0]), bounds[0], [low for low, _ in ends])
     upper = np.where(np.isfinite(bounds[1]), bounds[1], [high for _, high in ends])
-    for one, least, most in zip(model.variables, lower, upper, strict=True):
+    for variable, least, most in zip(model.variables, lower, upper, strict=True):
         if not least <= most:
             raise NoProblem(
-                f"{option('bounds')} of {one.quantity}_{one.surface}: from {least:g} to {most:g} there is nothing"
+                f"{option('bounds')} of {variable.quantity}_{variable.surface}: from {least:g} to {most:g} there is "
+                "nothing"
             )
     low, high = lower.copy(), upper.copy()
-    for k, one in enumerate(model.variables):
-        if one.quantity == "curvature" and length is not None:
+    for k, variable in enumerate(model.variables):
+        if variable.quantity == "curvature" and length is not None:
             low[k], high[k] = max(low[k], -STEEPEST / length), min(high[k], STEEPEST / length)
             low[k], high[k] = (low[k], high[k]) if low[k] <= high[k] else (lower[k], upper[k])
     start = np.clip(model.start, lower, upper)
@@ -299,15 +305,17 @@ def space_of(
     return Space(model, lower, upper, np.where(finite, low, start), np.where(finite, high, start), length)
 
 
-def _ends(model: DesignVariables, one: Vary, length: float | None, glass: Range, air: Range) -> tuple[float, float]:
+def _ends(
+    model: DesignVariables, variable: Vary, length: float | None, glass: Range, air: Range
+) -> tuple[float, float]:
     """Default bounds of a variable; infinite where there are none."""
-    if one.quantity in _SPREAD:
-        return _SPREAD[one.quantity]
-    if one.quantity not in ("curvature", "thickness") or one.surface == 0:
+    if variable.quantity in _SPREAD:
+        return _SPREAD[variable.quantity]
+    if variable.quantity not in ("curvature", "thickness") or variable.surface == 0:
         return -np.inf, np.inf
     if length is None:
         raise NoProblem(f"how large the lens is to be is not known: {option('hold')} its focal length, as efl=50")
-    if one.quantity == "curvature":
+    if variable.quantity == "curvature":
         aperture = model.lens.aperture
         if aperture.kind == "entrance_pupil_diameter":
             radius = 0.5 * float(aperture.value)
@@ -318,9 +326,9 @@ def _ends(model: DesignVariables, one: Vary, length: float | None, glass: Range,
             radius = 0.5 * diameter if np.isfinite(diameter) and diameter > 0 else length / 16
         steepest = min(1 / (0.9 * radius), 4 / length)
         return -steepest, steepest
-    if one.surface == sensor(model.lens):
+    if variable.surface == sensor(model.lens):
         return 0.05 * length, 2 * length if np.isinf(float(model.lens.surfaces[0].thickness)) else 20 * length
-    is_glass = abs(model.views[0].indices[model.lens.primary_wavelength - 1][one.surface]) > 1.01
+    is_glass = abs(model.views[0].indices[model.lens.primary_wavelength - 1][variable.surface]) > 1.01
     least, most = (glass if is_glass else air) or ((0.02, 0.2) if is_glass else (0.005, 0.35))
     scale = 1.0 if (glass if is_glass else air) else length
     return scale * least, scale * most if np.isfinite(most) else (0.2 if is_glass else 0.35) * length
@@ -329,10 +337,10 @@ def _ends(model: DesignVariables, one: Vary, length: float | None, glass: Range,
 def length_of(
     model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition]
 ) -> float | None:
-    """The focal length in mm that is held, or the target of a row, or that of the lens; None where it has none."""
-    for one in conditions:
-        if one.row.operand == "EFFL":
-            return abs(one.row.target * unit)
+    """The focal length in mm of `hold`, of the target of a row EFFL, or of the lens; None of an afocal lens."""
+    for condition in conditions:
+        if condition.row.operand == "EFFL":
+            return abs(condition.row.target * unit)
     targets = [row for row in rows if row.operand == "EFFL" and row.weight != 0 and row.target != 0]
     if targets:
         return abs(targets[0].target * unit)
@@ -362,7 +370,7 @@ class SearchProblem:
     bounds: tuple[np.ndarray, np.ndarray]
     glass: Range
     air: Range
-    settings: dict
+    settings: RowOptions
 
     @cached_property
     def space(self) -> Space:
@@ -374,14 +382,14 @@ class SearchProblem:
         return self.problem(self.rows)
 
     def problem(self, rows: Sequence[Row]) -> Problem:
-        """Of other rows."""
+        """The problem of other rows."""
         return Problem(self.model, rows, self.conditions, **self.settings)
 
     def about(self, seed: int) -> dict:
         """Dependencies of a search, for its journal."""
         return {
             **identity(self.model.lens),
-            "variables": [name_of(one) for one in self.model.variables],
+            "variables": [name_of(variable) for variable in self.model.variables],
             "start": self.model.start.tolist(),
             "bounds": [self.space.lower.tolist(), self.space.upper.tolist()],
             "rows": [repr(row) for row in self.whole.evaluation.rows],

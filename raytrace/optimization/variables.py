@@ -56,7 +56,7 @@ from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_yo
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
 
-#: What a solve is called, for which number it may stand, and how many numbers it takes, least and most.
+#: Solves by name: the quantity that each sets, and the smallest and largest count of its numbers.
 SOLVED_BY = {
     "marginal_angle": ("curvature", 1, 1),
     "f_number": ("curvature", 1, 1),
@@ -70,7 +70,7 @@ _ALONE = ("sensor", *(name for _, name in OF_LENS))
 #: Numbers that belong to a medium.
 MEDIA = (*GLASS, "glass")
 
-#: What is not varied by that name, and what is instead.
+#: Names that are no variables, and the variable that is meant.
 _INSTEAD = {"radius": "curvature", "focus": "sensor", "glasses": "glass", "abbe": "abbe_number"}
 
 _NUMBER = r"\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?"
@@ -95,15 +95,17 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
             raise BadVariables(f"the file has no variables: {option('vary')} names them, as 'curvature thickness'")
         return DesignVariables(lens, data.variables, of_file)
     listed = [vary] if isinstance(vary, str) else vary
-    variables: dict[str, Vary] = {name_of(one): one for one in listed if not isinstance(one, str)}
-    words = split_words([one for one in listed if isinstance(one, str)])
+    variables: dict[str, Vary] = {name_of(variable): variable for variable in listed if not isinstance(variable, str)}
+    words = split_words([word for word in listed if isinstance(word, str)])
     if variables and not words:
-        return DesignVariables(lens, tuple(vary), of_file)
+        return DesignVariables(lens, tuple(variable for variable in listed if isinstance(variable, Vary)), of_file)
     new = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     for word in words:
         if "=" not in word:
             solved = set() if ":" in word or word == "sensor" else _addresses((*new, *of_file))
-            variables |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & solved}
+            variables |= {
+                name_of(variable): variable for variable in varied(lens, word) if not _addresses([variable]) & solved
+            }
     if not variables:
         raise BadVariables(
             f"{option('vary', joined(words))} leaves nothing to vary; expected words like curvature thickness:5,6 "
@@ -112,48 +114,46 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
     free, solved = _addresses(variables.values()), _addresses(new)
     for surface, quantity, *_ in free & solved:
         raise BadVariables(f"{quantity}:{surface} is to vary and to follow: leave one out")
-    solves = (*(one for one in of_file if not _addresses([one]) & (free | solved)), *new)
+    solves = (*(solve for solve in of_file if not _addresses([solve]) & (free | solved)), *new)
     after = {
-        (one.surface, one.quantity): (one.source, one.quantity_of_source or one.quantity)
-        for one in solves
-        if one.kind == "pickup" and one.operand is None
+        solve.address: solve.address_of_source for solve in solves if solve.kind == "pickup" and solve.operand is None
     }
     for start in after:
-        at, passed = after[start], 0
-        while at in after and passed <= len(after):
-            at, passed = after[at], passed + 1
+        followed, passed = after[start], 0
+        while followed in after and passed <= len(after):
+            followed, passed = after[followed], passed + 1
         if passed > len(after):
             raise BadVariables(f"{start[1]}:{start[0]} follows itself, by way of other numbers")
     return DesignVariables(with_modelled(lens, (*variables.values(), *new)), tuple(variables.values()), solves)
 
 
 def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
-    """Of numbers; of a glass pickup all numbers of the glass; of a number of one configuration that configuration."""
+    """The addresses of numbers: all numbers of a glass that is picked up; with its configuration, if it has one."""
     addresses: set[tuple] = set()
-    for one in several:
-        at, is_solve = (one.surface, one.quantity), isinstance(one, Solve)
-        if not (is_solve and one.operand is not None):
-            addresses.add(at)
-        if one.operand is not None:
-            addresses.add((*at, one.configuration))
-        if is_solve and one.quantity == "glass":
-            addresses |= {(one.surface, name) for name in GLASS}
+    for moved in several:
+        address, is_solve = moved.address, isinstance(moved, Solve)
+        if not (is_solve and moved.operand is not None):
+            addresses.add(address)
+        if moved.operand is not None:
+            addresses.add((*address, moved.configuration))
+        if is_solve and moved.quantity == "glass":
+            addresses |= {(moved.surface, name) for name in GLASS}
     return addresses
 
 
 def _spaces(lens: Lens, kind: str) -> str:
     """The variable syntax of all air spaces, or of the thicknesses of all elements, by a name such as "air_spaces"."""
-    named = re.fullmatch("(air|glass)(_(space|gap|thickness|thicknesse)s?)?", kind)
+    match = re.fullmatch("(air|glass)(_(space|gap|thickness|thicknesse)s?)?", kind)
     inside = lens.surfaces[1:-1]
     in_air = [surface.glass.name in ("", "MIRROR") for surface in inside]
-    numbers = [k for k, air in enumerate(in_air, 1) if named and air == (named[1] == "air")]
+    numbers = [k for k, air in enumerate(in_air, 1) if match and air == (match[1] == "air")]
     return f"thickness:{','.join(map(str, numbers))}" if numbers else ""
 
 
 def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
-    """The numbers that one word names, by surface and configuration. Raises BadVariables."""
-    named, _, configurations = word.partition("@")
-    kind, colon, numbers = named.partition(":")
+    """The variables that a word names, by surface and configuration. Raises BadVariables."""
+    kind_of_surfaces, _, configurations = word.partition("@")
+    kind, colon, numbers = kind_of_surfaces.partition(":")
     of_surfaces = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
     known = dict.fromkeys(["thickness", *_ALONE, *MEDIA, *GROUPS, *of_surfaces])
     if (kind in _ALONE and colon) or (kind in _INSTEAD and kind not in known):
@@ -177,10 +177,11 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     else:
         surfaces = [k for k in range(1, sensor(lens) + 1) if _makes_sense(lens, kind, k)]
     only = counted(word, configurations, "configuration") if configurations else []
-    numbers = [one for k in surfaces for name in _quantities(lens, kind, k, word) for one in _each(lens, k, name)]
-    numbers = [one for one in numbers if not only or one.configuration in only]
-    if numbers:
-        return tuple(dict.fromkeys(numbers))
+    each = [(k, name) for k in surfaces for name in _quantities(lens, kind, k, word)]
+    variables = [variable for k, name in each for variable in _each(lens, k, name)]
+    variables = [variable for variable in variables if not only or variable.configuration in only]
+    if variables:
+        return tuple(dict.fromkeys(variables))
     if only:
         listed = f"configuration{'s' if len(only) > 1 else ''} {', '.join(map(str, only))}"
         raise BadVariables(f"{word!r}: no such number differs in {listed}; leave @ out")
@@ -192,11 +193,11 @@ def split_words(vary: str | Sequence[str]) -> list[str]:
     return re.sub(r"\s*([-=*+,(])\s*|\s*(\))", r"\1\2", joined(vary)).split()
 
 
-def name_of(one: Vary) -> str:
-    """A variable as bounds and tables call it: thickness_6, in configuration 2 thickness_6@2, aperture."""
-    if (one.surface, one.quantity) in OF_LENS:
-        return one.quantity
-    return f"{one.quantity}_{one.surface}" + (f"@{one.configuration}" if one.configuration else "")
+def name_of(variable: Vary) -> str:
+    """The name of a variable in bounds and tables: thickness_6, in configuration 2 thickness_6@2, aperture."""
+    if variable.address in OF_LENS:
+        return variable.quantity
+    return f"{variable.quantity}_{variable.surface}" + (f"@{variable.configuration}" if variable.configuration else "")
 
 
 def bounds_of(
@@ -209,43 +210,45 @@ def bounds_of(
     A name means all variables of a kind, one of a surface (thickness_3, or thickness:3-5 of several), or one in a
     configuration (thickness_3@2); later names override earlier ones. Raises BadVariables for a name of no variable.
     """
-    of_file = [one.bounds or (-np.inf, np.inf) for one in variables]
+    of_file = [variable.bounds or (-np.inf, np.inf) for variable in variables]
     low, high = (np.array([ends[k] for ends in of_file], dtype=float) for k in range(2))
     ends_by_name = bounds if isinstance(bounds, Mapping) else parse_bounds(joined(bounds or ""))
     names = []
-    for one in variables:
-        groups = {name for name, quantities in GROUPS.items() if one.quantity in quantities}
-        kinds = {one.quantity, *groups}
-        last = {"sensor"} if (one.surface, one.quantity) == (sensor(lens), "thickness") else set()
-        names.append({name_of(one), *kinds, *(f"{kind}_{one.surface}" for kind in kinds), *last})
+    for variable in variables:
+        groups = {name for name, quantities in GROUPS.items() if variable.quantity in quantities}
+        kinds = {variable.quantity, *groups}
+        last = {"sensor"} if variable.address == (sensor(lens), "thickness") else set()
+        names.append({name_of(variable), *kinds, *(f"{kind}_{variable.surface}" for kind in kinds), *last})
     for name, ends in ends_by_name.items():
         kind, _, surfaces = name.partition(":")
         wanted = {f"{kind}_{k}" for k in counted(name, surfaces)} if surfaces else {name}
         chosen = [position for position, known in enumerate(names) if wanted & known]
         if not chosen:
-            meant = did_you_mean(name, [one for known in names for one in known])
+            meant = did_you_mean(name, [known_name for known in names for known_name in known])
             raise BadVariables(f"{option('bounds')} for {name}, not among the variables{meant}")
         low[chosen], high[chosen] = ends
     return low, high
 
 
 def with_modelled(lens: Lens, moved: Sequence[Vary | Solve]) -> Lens:
-    """The lens with every such number modelled, at 0 where it was not, and glasses whose numbers move as model glasses.
+    """The lens with these numbers modelled, at 0 where they were not, and with model glasses where their numbers move.
 
-    Warns VariedGlass of the latter: between the lines of its definition a model glass is only near that of a catalog. A
-    lens whose temperature or pressure moves is in air of 20 °C and 1 atm if nothing else is given.
+    Warns VariedGlass of model glasses, which are only near the glass of a catalog between the lines of their
+    definition. A lens whose temperature or pressure moves is in air of 20 °C and 1 atm if nothing else is given.
     """
-    if {(one.surface, one.quantity) for one in moved} & {TEMPERATURE, PRESSURE}:
+    if {number.address for number in moved} & {TEMPERATURE, PRESSURE}:
         lens = with_environment(lens, None, None)
     surfaces = list(lens.surfaces)
-    for one in moved:
-        if (one.surface, one.quantity) in OF_LENS:
+    for number in moved:
+        if number.address in OF_LENS:
             continue
-        surface = surfaces[one.surface]
-        if one.quantity in GLASS:
-            surfaces[one.surface] = dataclasses.replace(surface, glass=_model_of(surface.glass, one.surface, lens))
-        elif one.quantity not in MEDIA:
-            surfaces[one.surface] = modelled(surface, one.quantity)
+        surface = surfaces[number.surface]
+        if number.quantity in GLASS:
+            surfaces[number.surface] = dataclasses.replace(
+                surface, glass=_model_of(surface.glass, number.surface, lens)
+            )
+        elif number.quantity not in MEDIA:
+            surfaces[number.surface] = modelled(surface, number.quantity)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
@@ -253,18 +256,18 @@ def _model_of(glass: Glass, surface: int, lens: Lens) -> Glass:
     """The model glass of the same index, Abbe number and partial dispersion."""
     if glass.formula in ("model", "constant"):
         return glass
-    found = model_glass(nd(glass).detach(), abbe_number(glass).detach(), normal_line_deviation(glass).detach())
-    off = refractive_index(found, lens.wavelengths) - refractive_index(glass, lens.wavelengths)
+    model = model_glass(nd(glass).detach(), abbe_number(glass).detach(), normal_line_deviation(glass).detach())
+    off = refractive_index(model, lens.wavelengths) - refractive_index(glass, lens.wavelengths)
     warnings.warn(
         f"surface {surface}: {glass.name} varies as a model glass, whose index is off by {float(off.abs().max()):.1g}",
         VariedGlass,
         stacklevel=calling_level(),
     )
-    return found
+    return model
 
 
 def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
-    """Whether a kind that is named alone means surface k too."""
+    """Whether a kind without surfaces, as "curvature", includes surface k."""
     surface = lens.surfaces[k]
     if kind == "curvature":
         return has_power(lens, k)
@@ -285,7 +288,7 @@ def has_power(lens: Lens, k: int) -> bool:
 
 
 def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
-    """The numbers of a surface that a kind stands for."""
+    """The numbers of a surface that belong to a kind, as tilt_x and tilt_y to "tilt"."""
     if kind == "thickness" and k == 0 and bool(torch.isfinite(lens.surfaces[0].thickness)):
         return [kind]
     last = sensor(lens) if kind in ("thickness", *MEDIA) else sensor(lens) + 1  # nothing is behind the image
@@ -301,18 +304,18 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
     if surface.is_break and kind in ("curvature", "conic"):
         raise BadVariables(f"{word!r}: surface {k} is a coordinate break")
     if missing := [quantity for quantity in wanted if quantity not in known]:
-        there = ", ".join(["thickness", *parameter_paths(surface)])
-        raise BadVariables(f"{word!r}: surface {k} has no {missing[0]}; it has {there}")
+        present = ", ".join(["thickness", *parameter_paths(surface)])
+        raise BadVariables(f"{word!r}: surface {k} has no {missing[0]}; it has {present}")
     return list(wanted)
 
 
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
-    """A number of a surface, or where it differs between the configurations one for each of them."""
+    """The variable of a number of a surface; where it differs between configurations, a variable for each of them."""
     for position, operand in enumerate(lens.operands):
-        addresses = [at for at, _ in addresses_of(lens, operand)] if operand.numbers is not None else []
-        if (k, quantity) in addresses:
-            at = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # which the others follow
-            return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]
+        addresses = [address for address, _ in addresses_of(lens, operand)]
+        if operand.numbers is not None and (k, quantity) in addresses:
+            first = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # the others follow it
+            return [Vary(*first, number, position) for number in range(1, len(operand.numbers) + 1)]
     return [Vary(k, quantity)]
 
 
@@ -320,12 +323,12 @@ def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
 
 
 def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[DesignVariables, tuple[int, ...]]:
-    """What varies but for glasses, and the surfaces whose glasses do.
+    """The design variables without "glass", and the surfaces whose glasses vary.
 
-    Those that the file marks, where words mean all; other numbers of those glasses vary no more. The file's variables
-    follow where words name nothing but glasses. Raises BadVariables.
+    Where a word means all glasses, those that the file marks vary, if it marks any. Other numbers of varied glasses do
+    not vary. The variables of the file vary where the words name glasses alone. Raises BadVariables.
     """
-    chosen = {one.surface for one in free.variables if one.quantity == "glass"}
+    chosen = {variable.surface for variable in free.variables if variable.quantity == "glass"}
     if not chosen:
         return free, ()
     chosen = _marked(free.lens, vary, chosen) - set(followers(free.lens))
@@ -334,8 +337,8 @@ def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[D
     if differing or not chosen:
         which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
         raise BadVariables(f"{option('vary', 'glass')}: the glass {which}")
-    own = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
-    others = _others(free.variables, chosen) or _others(own, chosen)
+    of_file = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
+    others = _others(free.variables, chosen) or _others(of_file, chosen)
     if not others:
         raise BadVariables(
             f"{option('vary', 'glass')}: nothing but glasses varies; name what follows them, as 'curvature glass'"
@@ -344,33 +347,35 @@ def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[D
 
 
 def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
-    """The variables but for glasses, and for numbers of glasses that are chosen."""
+    """The variables without "glass" and without numbers of the chosen glasses."""
     of_media = (*MEDIA, *GLASS)
     return tuple(
-        one for one in variables if one.quantity != "glass" and not (one.quantity in of_media and one.surface in chosen)
+        variable
+        for variable in variables
+        if variable.quantity != "glass" and not (variable.quantity in of_media and variable.surface in chosen)
     )
 
 
 def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[int]:
-    """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
-    words = vary if isinstance(vary, str) else " ".join(one for one in vary or () if isinstance(one, str))
+    """The surfaces whose glasses the file marks as exchangeable, of those that vary; all, if words name surfaces."""
+    words = vary if isinstance(vary, str) else " ".join(word for word in vary or () if isinstance(word, str))
     kept = () if lens.optimization_data is None else lens.optimization_data.kept
-    marked = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
+    marked = {solve.surface for solve in kept if (solve.quantity, solve.kind) == ("glass", "substitute")}
     all_meant = "glass" in words.split()
     return (marked & surfaces or surfaces) if all_meant else surfaces
 
 
 def followers(lens: Lens) -> dict[int, int]:
-    """Surfaces whose glass is that of another, and which one's."""
+    """Surfaces whose glass follows that of another surface, and that surface."""
     rules = () if lens.optimization_data is None else (*lens.optimization_data.solves, *lens.optimization_data.kept)
     return {
-        one.surface: one.source
-        for one in rules
-        if (one.quantity, one.kind) == ("glass", "pickup") and one.operand is None
+        rule.surface: rule.source
+        for rule in rules
+        if (rule.quantity, rule.kind) == ("glass", "pickup") and rule.operand is None
     }
 
 
-# -- what follows ------------------------------------------------------------------------------------------------------
+# -- solves and pickups ------------------------------------------------------------------------------------------------
 
 
 def _solves(lens: Lens, word: str) -> list[Solve]:
@@ -407,16 +412,16 @@ def _pickup(lens: Lens, word: str, k: int, quantity: str, parts: tuple) -> Solve
 
 
 def _arguments(word: str, solve: str, quantity: str, text: str) -> tuple[float, ...]:
-    """The numbers of a solve, if they are as many as it takes and it is one for that number of a surface."""
+    """The numbers of a solve. Raises BadVariables for another count of them, or a solve of another quantity."""
     solved, least, most = SOLVED_BY[solve]
     try:
-        found = tuple(float(part) for part in text.split(",") if part)
+        numbers = tuple(float(part) for part in text.split(",") if part)
     except ValueError:
         raise BadVariables(f"{word!r}: {text!r} are no numbers; expected {solve}(number)") from None
-    if quantity != solved or not least <= len(found) <= most:
+    if quantity != solved or not least <= len(numbers) <= most:
         expected = f"{least}" if least == most else f"{least} or {most}"
         raise BadVariables(f"{word!r}: {solve} solves for a {solved}, by {expected} number(s)")
-    return (*found, 0.0) if most == 2 and len(found) == 1 else found
+    return (*numbers, 0.0) if most == 2 and len(numbers) == 1 else numbers
 
 
 # -- constraints -------------------------------------------------------------------------------------------------------

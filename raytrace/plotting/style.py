@@ -6,12 +6,24 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.lines import Line2D
+    from mpl_toolkits.mplot3d.axes3d import Axes3D
+else:  # slow to load
+    Axes = Axes3D = Figure = SubFigure = Line2D = Any
+
+Arguments = ParamSpec("Arguments")
+Drawn = TypeVar("Drawn")
 
 INK = "#262626"
 GREY = "#7a7a7a"
@@ -25,11 +37,11 @@ INVISIBLE_COLOURS = ("#7a1f1f", "#525252", "#8c6d31", "#5e3c99", "#1b6f6a", "#b0
 GLASS_COLOURS = ("#e9f2f8", "#86b3d1")  # at n = 1.4 and n = 2.0
 WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
 
-#: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
-SUFFIXES = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+#: Formats of `save` by suffix, with the metadata that would otherwise differ from file to file.
+SUFFIXES: dict[str, dict[str, None]] = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 _PNG = {"compress_level": 4}  # of zlib; its default, 6, takes a fifth longer to save a figure, for 1 to 10 % less
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -57,40 +69,40 @@ _STYLE = {
 }
 
 
-def styled(function: Callable) -> Callable:
-    """Run a function under the style of these figures; the reader's own settings are back when it returns."""
+def styled(function: Callable[Arguments, Drawn]) -> Callable[Arguments, Drawn]:
+    """Run a function under the style of these figures; the settings of the user's own figures do not change."""
 
     @functools.wraps(function)
-    def wrapper(*args, **kwargs):
+    def wrapper(*arguments: Arguments.args, **options: Arguments.kwargs) -> Drawn:
         import matplotlib
 
         with matplotlib.rc_context(_STYLE):
-            return function(*args, **kwargs)
+            return function(*arguments, **options)
 
     return wrapper
 
 
-def new_figure(width: float, height: float):
-    """A figure of width × height inches on a canvas of its own, which a notebook shows."""
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of width × height inches with a canvas, which a notebook shows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
-    figure.get_layout_engine().set(w_pad=0.07, h_pad=0.07)
+    figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
+    figure.set_layout_engine("constrained", w_pad=0.07, h_pad=0.07)
     FigureCanvasAgg(figure)
-    figure._repr_png_ = functools.partial(_png, figure)  # IPython shows figures of pyplot alone by itself
+    setattr(figure, "_repr_png_", functools.partial(_png, figure))  # noqa: B010, IPython shows figures of pyplot alone
     return figure
 
 
 @styled
-def _png(figure) -> bytes:
+def _png(figure: Figure) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png")
     return file.getvalue()
 
 
 @styled
-def save(figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
+def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     """Write a figure as .png, .pdf or .svg by its suffix; the file is replaced as a whole or not at all.
 
     The same figure, built again, gives the same bytes. Raises ValueError for another suffix, OSError where nothing can
@@ -98,11 +110,11 @@ def save(figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        found = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
-        raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
-    how = {"pil_kwargs": _PNG} if suffix == ".png" else {}
+        ending = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
+        raise ValueError(f"{path}: {ending} is no format of figures; expected one of {', '.join(SUFFIXES)}")
+    options: dict[str, Any] = {"pil_kwargs": _PNG} if suffix == ".png" else {}
     metadata = SUFFIXES[suffix]
-    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=metadata, **how))
+    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=metadata, **options))
 
 
 def array(tensor: Tensor) -> np.ndarray:
@@ -135,7 +147,8 @@ def field_colours(count: int) -> list[str]:
 
 def wavelength_colours(wavelengths: Sequence[float]) -> list[str | tuple[float, float, float]]:
     """A colour for each wavelength in µm: the one the eye sees, dark enough for a white page, where it sees one."""
-    colours, unseen = [], 0
+    colours: list[str | tuple[float, float, float]] = []
+    unseen = 0
     for wavelength in wavelengths:
         if 0.39 <= wavelength <= 0.75:
             colours.append(_spectral_colour(float(wavelength)))
@@ -161,7 +174,8 @@ def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
         0.555: "#3f9a12", 0.575: "#8a9400", 0.59: "#c78500", 0.61: "#dd5f00", 0.64: "#d62828", 0.75: "#8b0f14",
     }  # fmt: skip
     channels = np.array([to_rgb(colour) for colour in knots.values()]).T
-    return tuple(float(np.interp(wavelength, list(knots), channel)) for channel in channels)
+    red, green, blue = (float(np.interp(wavelength, list(knots), channel)) for channel in channels)
+    return red, green, blue
 
 
 def length_text(length: float, digits: int = 4) -> str:
@@ -200,7 +214,7 @@ def round_text(length: float) -> str:
     return f"{length * scale:.6g} {unit}"
 
 
-def scale_bar(axes, x: float, y: float, length: float, align: str = "center") -> None:
+def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "center") -> None:
     """A bar of a length in mm that starts at (x, y), its length written above it: centred, or from its "left"."""
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
     place = (x if align == "left" else x + length / 2, y)
@@ -210,7 +224,7 @@ def scale_bar(axes, x: float, y: float, length: float, align: str = "center") ->
     )  # fmt: skip
 
 
-def bar_on_dark(axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
+def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
     """A white bar of a length in mm from (x, y), on axes of so many mm a unit, its length written above it."""
     from matplotlib.patheffects import withStroke
 
@@ -223,16 +237,17 @@ def bar_on_dark(axes, x: float, y: float, length: float, words: str = "", *, uni
     )  # fmt: skip
 
 
-def show_image(panel, values, title: str = "", *, top: float = 1.0, **drawing) -> None:
+def show_image(panel: Axes, values: np.ndarray | Tensor, title: str = "", *, top: float = 1.0, **drawing: Any) -> None:
     """A grey or coloured image from 0 to `top`."""
-    panel.imshow(values, **{"cmap": "gray", "vmin": 0, "vmax": top, "interpolation": "nearest"} | drawing)
+    options: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+    panel.imshow(values, **options | drawing)
     panel.set(xticks=[], yticks=[])
     panel.set_title(title, fontsize=7.5)
     for spine in panel.spines.values():
         spine.set_visible(False)
 
 
-def framed(panel) -> None:
+def framed(panel: Axes) -> None:
     """A panel with a thin grey frame and no ticks."""
     panel.set(xticks=[], yticks=[])
     for spine in panel.spines.values():
@@ -240,7 +255,7 @@ def framed(panel) -> None:
         spine.set_color(GREY)
 
 
-def legend_entry(label: str, **look):
+def legend_entry(label: str, **look: Any) -> Line2D:
     """A line or marker of a legend that no curve has."""
     from matplotlib.lines import Line2D
 
@@ -257,11 +272,11 @@ def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
     for paragraph in text.splitlines():
         line, length = "", 0.0
         for word in paragraph.split(" "):
-            own = _width(word, size, bold)
-            if line and length + space + own > room:
+            width_of_word = _width(word, size, bold)
+            if line and length + space + width_of_word > room:
                 lines.append(line)
                 line, length = "", 0.0
-            line, length = (f"{line} {word}", length + space + own) if line else (word, own)
+            line, length = (f"{line} {word}", length + space + width_of_word) if line else (word, width_of_word)
         lines.append(line)
     return "\n".join(lines)
 

@@ -7,6 +7,7 @@ million waves of piston lose no precision.
 import math
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
 
 
 def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
-    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
+    """The sum of `to_grid` over pairs of waves (L, M) and (-L, M) of equal field, given one of each: a real product."""
 
     def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
         cosine = 2 * torch.cos(2 * math.pi * _fraction(_columns(L, x, wavelength)))
@@ -111,10 +112,10 @@ def on_lattice(field: Tensor, u: Tensor, v: Tensor, shape: tuple[int, int]) -> T
     """
     sigma, near = 0.67, torch.arange(-1, 3, device=u.device)
     sides, places = [2 * count for count in shape], []
-    for at in (v * sides[0], u * sides[1]):
-        first = torch.floor(at)
+    for position in (v * sides[0], u * sides[1]):
+        first = torch.floor(position)
         low = first.min() - 1
-        weight = torch.exp((at[:, None] - first[:, None] - near) ** 2 / (-2 * sigma**2))
+        weight = torch.exp((position[:, None] - first[:, None] - near) ** 2 / (-2 * sigma**2))
         places.append(((first - low)[:, None].long() + near, weight))
     (rows, down), (columns, across) = places
     spread = field[:, None, None] * (down[:, :, None] * across[:, None, :])
@@ -163,12 +164,12 @@ def _in_chunks(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Te
 
 def bessel_j0(x: Tensor) -> Tensor:
     """J₀ with its derivatives (those of torch.special detach silently)."""
-    return applied(_Bessel, x, 0, slopes=lambda *of: (_bessel_slope(*of),))
+    return applied(_Bessel, x, 0, slopes=lambda x, number: (_bessel_slope(x, number),))
 
 
 def bessel_j1(x: Tensor) -> Tensor:
     """J₁ with its derivatives (those of torch.special detach silently)."""
-    return applied(_Bessel, x, 1, slopes=lambda *of: (_bessel_slope(*of),))
+    return applied(_Bessel, x, 1, slopes=lambda x, number: (_bessel_slope(x, number),))
 
 
 def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
@@ -244,22 +245,22 @@ class _Bessel(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(x, number: int):
+    def forward(x: Tensor, number: int) -> Tensor:
         return (torch.special.bessel_j0, torch.special.bessel_j1)[number](x)
 
     @staticmethod
-    def setup_context(ctx, inputs, output):
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
         x, ctx.number = inputs
         ctx.save_for_backward(x)
         ctx.save_for_forward(x)
 
     @staticmethod
-    def backward(ctx, gradient):
-        return gradient * _bessel_slope(*ctx.saved_tensors, ctx.number), None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return gradient * _bessel_slope(ctx.saved_tensors[0], ctx.number), None
 
     @staticmethod
-    def jvp(ctx, tangent, _):
-        return tangent * _bessel_slope(*ctx.saved_tensors, ctx.number)
+    def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
+        return tangent * _bessel_slope(ctx.saved_tensors[0], ctx.number)
 
 
 def _bessel_slope(x: Tensor, number: int) -> Tensor:

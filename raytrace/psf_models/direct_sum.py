@@ -9,6 +9,7 @@ used. One object distance, field and wavelength; no gradients.
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -117,7 +118,7 @@ def clear_rings(scene: Scene, rings: int, arms: int) -> tuple[Tensor, Tensor]:
     return (unit[:, None] * radius).flatten(1), (area * weights.reshape(rings, arms)).flatten()
 
 
-def _bisect(passes, clear: Tensor, dark: Tensor) -> Tensor:
+def _bisect(passes: Callable[[Tensor], Tensor], clear: Tensor, dark: Tensor) -> Tensor:
     """The radius (arms) of the edge between clear and dark; both are the same if there is none."""
     for _ in range(_BISECTIONS):
         middle = 0.5 * (clear + dark)

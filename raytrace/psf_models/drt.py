@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford
-from raytrace.maths.numerics import safe_divide, value, varies
+from raytrace.maths.numerics import broadcast_shape, safe_divide, value, varies
 from raytrace.maths.sampling import Grid, sobol
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf_models.result import Kernels, moments_of_rays
@@ -115,8 +115,8 @@ def cell_widths(grid: Grid, points: Tensor, largest: Callable[[Tensor], Tensor])
     across, along = (torch.roll(w, -1, -2) - w).abs(), w.diff().abs()
     sides = torch.maximum(across[..., 1:], across[..., :-1]), torch.maximum(along, torch.roll(along, -1, -2))
     widest = largest(torch.stack([side.amax() for side in sides])).unbind()
-    both = sum(safe_divide(side, most.expand_as(side)) for side, most in zip(sides, widest, strict=True))
-    return *(float(most) for most in widest), max(1.0, float(largest(both.amax())))
+    first, second = (safe_divide(side, most.expand_as(side)) for side, most in zip(sides, widest, strict=True))
+    return float(widest[0]), float(widest[1]), max(1.0, float(largest((first + second).amax())))
 
 
 def cells(w: Tensor, radius: Tensor, *, closed: bool = True) -> tuple[Tensor, Tensor, Tensor]:
@@ -187,13 +187,13 @@ def _shared(grid: Grid, weights: Tensor, along_x: tuple[Tensor, Tensor], along_y
 
 def _deposit(grid: Grid, column: Tensor, row: Tensor, energies: list[Tensor], *, axes: int = 1) -> Tensor:
     """Pixels (..., rows, columns) of energies (..., P) in (column, row) and its neighbours right, above and both."""
-    image, dropped = None, grid.rows * grid.columns
+    batch, dropped = broadcast_shape(column.shape, row.shape)[:-axes], grid.rows * grid.columns
+    image = energies[0].new_zeros(*batch, dropped + 1)
     for (right, up), energy in zip(((0, 0), (1, 0), (0, 1), (1, 1)), energies, strict=False):
         i, j = column + right, row + up
         inside = (i >= 0) & (i < grid.columns) & (j >= 0) & (j < grid.rows)
         place = torch.where(inside, j * grid.columns + i, dropped).flatten(-axes)
         energy = energy.expand(inside.shape).flatten(-axes)
-        image = energy.new_zeros(*place.shape[:-1], dropped + 1) if image is None else image
         image = image.scatter_add(-1, place, energy)
     return image[..., :-1].unflatten(-1, grid.shape)
 
@@ -240,7 +240,7 @@ def kernels_of_rays(
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
     like = scene.lens.surfaces[-2].thickness
     points, _ = sampling(rays, dtype=like.dtype, device=like.device)
-    return dataclasses.replace(kernels_of_points(scene, grid, points, width=width), rays=rays)
+    return kernels_of_points(scene, grid, points, width=width, rays=rays)
 
 
 def trace_fans(scene: Scene, order: int) -> Fans:
@@ -311,7 +311,7 @@ def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
     height = max(1, _CHUNK // fans.points[0, ..., 0, :].numel())
 
     def between(first: int, last: int, cells_round: int) -> Tensor:
-        kernel = 0.0
+        kernel = torch.zeros_like(fans.radius[0])
         for start in range(first, last, height):
             rows = torch.arange(start, min(start + height, last) + 1, device=fans.points.device) % count
             points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
@@ -385,15 +385,17 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(weights.sum((-2, -1)) > 0, centroid, 0.0), covariance
 
 
-def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, *, width: float = _RAY_WIDTH) -> Kernels:
-    """Kernels of independent rays through pupil points (2, P), all of one weight."""
-    traced = trace_scene(scene, disc)
-    energy = torch.where(traced.valid, 1 / disc.shape[1], 0.0).expand(*scene.shape, -1)
+def kernels_of_points(
+    scene: Scene, grid: Grid, disc: Tensor, *, width: float = _RAY_WIDTH, rays: int | None = None
+) -> Kernels:
+    """Kernels of independent rays through pupil points (2, P), all of one weight, 1/rays; rays: P by default."""
+    traced, rays = trace_scene(scene, disc), disc.shape[1] if rays is None else rays
+    energy = (traced.valid.to(traced.position) / rays).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]
     centroid, covariance = moments_of_rays(points, energy)
-    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=energy.sum(-1) * light)
+    return Kernels(kernel, grid, centroid, covariance, rays, arrived=energy.sum(-1) * light)
 
 
 @torch.no_grad()
@@ -413,8 +415,10 @@ def stream_kernels(
     """
     shape, lens = scene.shape, scene.lens
     like = lens.surfaces[-2].thickness
-    at = (with_object_distance(lens, d) for d in lens.surfaces[0].thickness.flatten().unbind(0))
-    shots = [s for here in at for s in streaming.shots_of(here, rays, scene.fields, scene.wavelengths, None, None)[0]]
+    shots = []
+    for distance in lens.surfaces[0].thickness.flatten().unbind(0):
+        view = with_object_distance(lens, distance)
+        shots += streaming.shots_of(view, rays, scene.fields, scene.wavelengths, None, None)[0]
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))).expand(2, *shape)
     grids = [dataclasses.replace(grid, centre=c) for c in centre.flatten(1).unbind(1)]
     size = streaming.chunk_size(shots[0], max_bytes, kept=3 * 8 * len(shots) * grid.rows * grid.columns)
@@ -436,11 +440,14 @@ def stream_kernels(
     pairs = zip(references, sums, strict=True)
     m = streaming.stacked([streaming.Moments(m.count, r + m.mean, m.scatter) for r, m in pairs], shape)
     light = beam_share(scene).double()
-    about, arrived = (m.mean, safe_divide(m.scatter, m.count)), light * m.count / rays
+    covariance, arrived = safe_divide(m.scatter, m.count), light * m.count / rays
     whole, first = (
         k.unflatten(0, shape) * (light / count)[..., None, None] for k, count in ((images, rays), (before, half))
     )
-    return Kernels(whole, grid, *about, rays, arrived=arrived), Kernels(first, grid, *about, half, arrived=arrived)
+    return (
+        Kernels(whole, grid, m.mean, covariance, rays, arrived=arrived),
+        Kernels(first, grid, m.mean, covariance, half, arrived=arrived),
+    )
 
 
 def deposit(grid: Grid, points: Tensor, energy: Tensor, width: float) -> Tensor:
@@ -508,26 +515,27 @@ def fit(scene: Scene, degree: int) -> RayMap:
     axial, mirrored = fold == "round", fold == "mirror"
     constant = like.new_tensor
     if axial:
-        terms = degree // 2 + 1  # positive Chebyshev nodes: heights on the y axis
-        height = np.cos((2 * np.arange(terms) + 1) * np.pi / (4 * terms))
+        nodes = degree // 2 + 1  # positive Chebyshev nodes: heights on the y axis
+        height = np.cos((2 * np.arange(nodes) + 1) * np.pi / (4 * nodes))
         checked = np.sqrt((np.arange(4) + 1) / 4)
         disc = np.stack([np.zeros(len(height) + 4), np.concatenate([height, checked])])
         solve, check = np.linalg.inv(_axial_basis(degree, height)), _axial_basis(degree, checked)
-        source = sign = None
+        mirror = None
     else:
-        fitted, checked, source, sign = _disc_nodes(degree, mirrored)
+        fitted, checked, mirror = _disc_nodes(degree, mirrored)
         disc = np.concatenate([fitted, checked], 1)
         solve, check = _solution(degree), _basis(degree, checked)
     hits, crossed, met = trace_apertures(scene, constant(disc))
     count = disc.shape[1] - check.shape[0]
-    solve, check = constant(solve), constant(check)
+    to_terms, to_checks = constant(solve).T, constant(check).T
 
     def coefficients(points: Tensor) -> Tensor:
         points = points[..., :count]
-        if source is not None:
+        if mirror is not None:
+            source, sign = mirror
             points = points[..., torch.as_tensor(source, device=points.device)]
             points = torch.stack([points[0] * constant(sign), points[1]])
-        return points @ solve.T
+        return points @ to_terms
 
     def largest(error: Tensor) -> Tensor:
         return torch.where(met.all(-1), error.detach().abs().amax(-1), float("inf"))
@@ -536,9 +544,9 @@ def fit(scene: Scene, degree: int) -> RayMap:
     crossings = tuple(coefficients(hit) for _, hit in crossed)
     edge = torch.zeros_like(hits[0, ..., 0])
     for (aperture, hit), terms in zip(crossed, crossings, strict=True):
-        error = clearance(aperture, terms @ check.T) - clearance(aperture, hit[..., count:])
+        error = clearance(aperture, terms @ to_checks) - clearance(aperture, hit[..., count:])
         edge = torch.maximum(edge, largest(error))
-    residual = largest((mapped @ check.T - hits[..., count:]).abs().amax(0))
+    residual = largest((mapped @ to_checks - hits[..., count:]).abs().amax(0))
     apertures = tuple(aperture for aperture, _ in crossed)
     return RayMap(degree, axial, mapped, crossings, apertures, residual, edge, disc.shape[1], mirrored)
 
@@ -604,8 +612,8 @@ def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) 
     nodes = np.linspace(0, 1, math.ceil(_PIECES * 2 ** (order / 2)) + 1)
     basis = like.new_tensor(_axial_basis(ray_map.degree, nodes))
     height, *crossed = (terms[1] @ basis.mT for terms in (ray_map.hits, *ray_map.crossings))
-    crossed = (torch.stack([torch.zeros_like(hit), hit]) for hit in crossed)
-    clearances = [clearance(aperture, hit) for aperture, hit in zip(ray_map.apertures, crossed, strict=True)]
+    pairs = zip(ray_map.apertures, crossed, strict=True)
+    clearances = [clearance(aperture, torch.stack([torch.zeros_like(hit), hit])) for aperture, hit in pairs]
     first, last, share = lit_part(height[..., :-1], height[..., 1:], clearances)
     energy = (share * like.new_tensor(np.diff(nodes**2))).expand(first.shape)
     kernel = unfold(grid, energy_of_rings(grid, first, last, energy)) * beam_share(scene)[..., None, None]
@@ -632,18 +640,19 @@ def _axial_basis(degree: int, radius: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=32)
-def _disc_nodes(degree: int, mirrored: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Points (2, ...) traced to fit and to check; and for each ring point the traced one with its sign in x."""
+def _disc_nodes(degree: int, mirrored: bool) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+    """Points (2, ...) traced to fit and to check; of mirrored light, the traced point and its sign in x for each ring
+    point."""
     rings = _rings(degree)
     step = np.arange(_CHECKS)
     radius, angle = np.sqrt((step + 1) / _CHECKS), np.pi * (3 - 5**0.5) * step + 0.3
     checked = radius * np.stack([np.cos(angle), np.sin(angle)])
     if not mirrored:
-        return rings, checked, None, None
+        return rings, checked, None
     kept = np.flatnonzero(rings[0] > -1e-12)
-    mirror = np.abs(rings[0, kept])[None] - np.abs(rings[0])[:, None], rings[1, kept][None] - rings[1][:, None]
-    source = np.argmin(mirror[0] ** 2 + mirror[1] ** 2, 1)
-    return rings[:, kept], np.stack([np.abs(checked[0]), checked[1]]), source, np.where(rings[0] < -1e-12, -1.0, 1.0)
+    apart = np.abs(rings[0, kept])[None] - np.abs(rings[0])[:, None], rings[1, kept][None] - rings[1][:, None]
+    mirror = np.argmin(apart[0] ** 2 + apart[1] ** 2, 1), np.where(rings[0] < -1e-12, -1.0, 1.0)
+    return rings[:, kept], np.stack([np.abs(checked[0]), checked[1]]), mirror
 
 
 @functools.lru_cache(maxsize=32)

@@ -4,9 +4,11 @@
 """
 
 import dataclasses
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +16,19 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.sampling import Grid
-from raytrace.plotting.style import GREY, INK, array, bar_on_dark, fill, framed, new_figure, round_length, styled
+from raytrace.plotting.style import (
+    GREY,
+    INK,
+    Axes,
+    Figure,
+    array,
+    bar_on_dark,
+    fill,
+    framed,
+    new_figure,
+    round_length,
+    styled,
+)
 from raytrace.psf_models.models import MODELS, NotConverged, psf
 from raytrace.psf_models.result import EmptyPsf, Psf, mixture
 from raytrace.system.lens import field_label, with_object_distance
@@ -51,15 +65,24 @@ def close_up_of(psfs: Psf) -> CloseUp:
     """
     half, centre = _windows(psfs)
     plain = MODELS[psfs.model].plain is not None
-    model = dataclasses.replace(psfs.parameters, **({"rays": _RAYS, "order": None} if plain else {"order": psfs.order}))
-    colours = {"wavelengths": psfs.wavelengths, "wavelength_weights": psfs.wavelength_weights}
-    colours |= {"per_wavelength": not psfs.wavelengths_summed}
+    numbers: dict[str, Any] = {"rays": _RAYS, "order": None} if plain else {"order": psfs.order}
+    parameters = psfs.parameters or MODELS[psfs.model].parameters()
+    model = dataclasses.replace(parameters, **numbers)
 
     def light(distances: slice, fields: slice) -> Tensor:
         grid = Grid(2 * half[distances, fields].max() / _SAMPLES, _SAMPLES, _SAMPLES, centre[:, distances, fields])
-        where = {"fields": psfs.fields[:, fields], "object_distances": psfs.object_distances[distances]}
         try:
-            return psf(psfs.lens, model, grid=grid, center="axis", **where, **colours).kernel
+            return psf(
+                psfs.lens,
+                model,
+                fields=psfs.fields[:, fields],
+                object_distances=psfs.object_distances[distances],
+                wavelengths=psfs.wavelengths,
+                wavelength_weights=psfs.wavelength_weights,
+                grid=grid,
+                center="axis",
+                per_wavelength=not psfs.wavelengths_summed,
+            ).kernel
         except EmptyPsf:
             return psfs.kernel.new_zeros(*psfs.energy[distances, fields].shape, _SAMPLES, _SAMPLES)
 
@@ -103,7 +126,7 @@ _LINE = 4  # kernels of one distance in a line
 
 
 @styled
-def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
+def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -> Figure:
     """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
     Where its pixels were specified, or rays are independent, pixels are drawn; else the light itself in windows that
@@ -129,17 +152,17 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False):
     if close_up is None:
         figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log, line)
         return worded(figure, title, [f"{window(psfs.grid)}; max: light of the brightest pixel", brightness(log)])
-    drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
+    light, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
-    figure, axes = panels(drawn, halves, distances, labels, notes, log, line)
+    figure, axes = panels(light, halves, distances, labels, notes, log, line)
     centre = array(psfs.grid.centre).reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
         for d, panel in enumerate(row):
             _draw_pixels(panel, place[:, d], pitch, psfs.grid.columns, psfs.grid.rows)
     size = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
-    drawn = f"{size}; energy and brightest pixel (max): of the {window(psfs.grid)}, outlined where they lie inside"
-    return worded(figure, title, [drawn, brightness(log)])
+    note = f"{size}; energy and brightest pixel (max): of the {window(psfs.grid)}, outlined where they lie inside"
+    return worded(figure, title, [note, brightness(log)])
 
 
 def _rows(values: np.ndarray, kept: int) -> np.ndarray:
@@ -148,7 +171,15 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
     return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
 
 
-def panels(kernels, halves, distances, labels, notes, log: bool, line: int = _LINE):
+def panels(
+    kernels: Sequence[np.ndarray] | np.ndarray,
+    halves: Sequence[Sequence[float]] | np.ndarray,
+    distances: Sequence[float],
+    labels: Sequence[str],
+    notes: Sequence[Sequence[str]],
+    log: bool,
+    line: int = _LINE,
+) -> tuple[Figure, np.ndarray]:
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
     Distances are above and labels on the left; kernels of one distance follow each other in lines of `line`, each
@@ -163,8 +194,8 @@ def panels(kernels, halves, distances, labels, notes, log: bool, line: int = _LI
     grid = figure.subplots(*shape, squeeze=False)
     axes = grid.reshape(-1, 1)[:rows] if flows else grid
     alike = len({round(float(half), 12) for row in halves for half in row}) == 1
-    for row, column in np.ndindex(rows, columns):
-        panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
+    for row, column in itertools.product(range(rows), range(columns)):
+        panel, kernel, half = axes[row, column], kernels[row][column], float(halves[row][column])
         tall = half * kernel.shape[0] / kernel.shape[1]
         extent = (-half, half, -tall, tall)
         peak = float(kernel.max()) or 1.0
@@ -190,7 +221,7 @@ def brightness(log: bool) -> str:
     return f"each panel from {f'{10.0**-DECADES:g} of its own peak, logarithmic' if log else '0 to its own peak'}"
 
 
-def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
+def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
     """Outline the window of a kernel about a centre (2,) mm; and its pixels, where a panel holds only a few."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -199,20 +230,20 @@ def _draw_pixels(panel, centre: np.ndarray, pitch: float, columns: int, rows: in
     corner = centre - 0.5 * pitch * np.array([columns, rows])
     if pitch * _MOST_PIXELS >= high - low:
         x, y = (corner[k] + pitch * np.arange(count + 1) for k, count in enumerate((columns, rows)))
-        lines = [[(at, y[0]), (at, y[-1])] for at in x if low < at < high]
-        lines += [[(x[0], at), (x[-1], at)] for at in y if bottom < at < top]
+        lines = [[(edge, y[0]), (edge, y[-1])] for edge in x if low < edge < high]
+        lines += [[(x[0], edge), (x[-1], edge)] for edge in y if bottom < edge < top]
         edges = LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45, gid="pixels")
         panel.add_collection(edges, autolim=False)
-    line = {"fill": False, "edgecolor": "white", "linewidth": 0.7, "alpha": 0.7, "gid": "window"}
-    panel.add_patch(Rectangle(corner, pitch * columns, pitch * rows, **line))
+    line: dict[str, Any] = {"fill": False, "edgecolor": "white", "linewidth": 0.7, "alpha": 0.7, "gid": "window"}
+    panel.add_patch(Rectangle((corner[0], corner[1]), pitch * columns, pitch * rows, **line))
     panel.set(xlim=(low, high), ylim=(bottom, top))
 
 
-def worded(figure, title: str, said: Sequence[str]):
-    """The title above and one caption below, both in lines that fit."""
+def worded(figure: Figure, title: str, notes: Sequence[str]) -> Figure:
+    """The figure with a title above and one caption below, both wrapped to its width."""
     width = figure.get_figwidth()
     figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)
-    figure.supxlabel(fill("; ".join(said), width, 7.5), fontsize=7.5, color=GREY)
+    figure.supxlabel(fill("; ".join(notes), width, 7.5), fontsize=7.5, color=GREY)
     return figure
 
 

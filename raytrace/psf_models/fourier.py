@@ -57,7 +57,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     need_one_focus(scene.lens, "the Fourier PSF model", "take model=wave, which traces the wavefront")
     # In single precision a phase of hundreds of radians has three digits.
     single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
-    scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))
+    scene, window = (to(scene, dtype=torch.float64), to(grid, dtype=torch.float64)) if single else (scene, grid)
     lens, waves = paraxial(scene), None
     numbers = torch.stack([lens.defocus.detach(), lens.frequency.detach()])
     if not bool(torch.isfinite(numbers).all()) or not bool((numbers[1] != 0).all()):
@@ -73,8 +73,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
         kernel, centroid, covariance = _round_kernels(scene, lens, window, order)
     else:
         kernel, centroid, covariance = _kernels(scene, lens, window, waves, order)
-    limit = {"ray_centroid": lens.chief + shift, "ray_covariance": blur}
-    shifted = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
+    shifted = Kernels(
+        kernel, grid, lens.chief + centroid, covariance, rays=0, ray_centroid=lens.chief + shift, ray_covariance=blur
+    )
     return dataclasses.replace(to(shifted, dtype=grid.pitch.dtype), grid=grid) if single else shifted
 
 
@@ -94,7 +95,7 @@ def _kernels(
         dft.afford_rings("the Fourier PSF", scene, dft.rings_and_arms(phase, order)[0], phase)
     pixels, moments = [], []
     for place in itertools.product(*map(range, shape)):
-        noll = None if waves is None else waves[(slice(None), *place)]
+        noll = None if waves is None else waves.movedim(0, -1)[place]
         intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], noll, order=order)
         pixels.append(dft.integrate(intensity, weight, window.pitch))
         moments.append(dft.window_moments(intensity, x[place], y[place], weight, window.pitch))

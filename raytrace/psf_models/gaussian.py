@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,7 +61,7 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
     variance_x, variance_y = (torch.where(t > smallest, t, 0.0)[..., None, None] for t in (xx, yy))
     if len(covariance) == 2:
         across, along = _sides(x, x_edges, y, y_edges, half)
-        return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
+        return _interval(across, safe_sqrt(variance_x)) * _interval(along, safe_sqrt(variance_y))
     xy = torch.where(both, covariance[1], 0.0)[..., None, None]
     return applied(_Rotated, x, y, half, variance_x, variance_y, xy, x_edges, y_edges, slopes=_slopes)
 
@@ -87,8 +88,12 @@ def wide_gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Te
     return peak * torch.exp(-0.5 * (a * x + b * y)) * (1 - (square * square / 2880) * fourth)
 
 
-def _sides(x: Tensor, x_edges: Tensor, y: Tensor, y_edges: Tensor, half: Tensor) -> tuple[tuple, tuple]:
-    """Lower and upper edge, middle and half width of the pixels along x (..., 1, columns) and y (..., rows, 1)."""
+#: Lower and upper edge, middle and half width of intervals, mm.
+Side = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _sides(x: Tensor, x_edges: Tensor, y: Tensor, y_edges: Tensor, half: Tensor) -> tuple[Side, Side]:
+    """The sides of the pixels along x (..., 1, columns) and y (..., rows, 1)."""
     return (x_edges[..., :-1], x_edges[..., 1:], x, half), (y_edges[..., :-1, :], y_edges[..., 1:, :], y, half)
 
 
@@ -99,9 +104,9 @@ def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
     return torch.where(resolved, quotient, _FAR * torch.sign(distance.detach()))
 
 
-def _interval(lower: Tensor, upper: Tensor, middle: Tensor, half: Tensor, sigma: Tensor) -> Tensor:
-    """Φ(upper/σ) - Φ(lower/σ) to a few roundings of its own size; middle, half: of the same interval, all mm."""
-    a, b, m, h = (_standard(distance, sigma) for distance in (lower, upper, middle, half))
+def _interval(side: Side, sigma: Tensor) -> Tensor:
+    """Φ(upper/σ) - Φ(lower/σ), with a relative error of a few roundings."""
+    a, b, m, h = (_standard(distance, sigma) for distance in side)
     root = 2.0**-0.5
     left = m < 0
     near, far = root * torch.where(left, -b, a), root * torch.where(left, -a, b)
@@ -141,33 +146,44 @@ class _Rotated(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(x, y, half, xx, yy, xy, x_edges, y_edges):
+    def forward(
+        x: Tensor,
+        y: Tensor,
+        half: Tensor,
+        xx: Tensor,
+        yy: Tensor,
+        xy: Tensor,
+        x_edges: Tensor,
+        y_edges: Tensor,
+    ) -> Tensor:
         return _energy(*_sides(x, x_edges, y, y_edges, half), xx, xy, yy)
 
     @staticmethod
-    def setup_context(ctx, inputs, output):
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
         ctx.save_for_forward(*inputs)
 
     @staticmethod
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         slopes = (gradient * slope for slope in _slopes(*ctx.saved_tensors))
         return *(g.sum_to_size(t.shape) for g, t in zip(slopes, ctx.saved_tensors, strict=False)), None, None
 
     @staticmethod
-    def jvp(ctx, *tangents):
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
         pairs = zip(_slopes(*ctx.saved_tensors), tangents, strict=False)
-        return sum(slope * tangent for slope, tangent in pairs if tangent is not None)
+        return functools.reduce(torch.add, (slope * tangent for slope, tangent in pairs if tangent is not None))
 
 
-def _slopes(x, y, half, xx, yy, xy, x_edges, y_edges) -> tuple[Tensor, ...]:
+def _slopes(
+    x: Tensor, y: Tensor, half: Tensor, xx: Tensor, yy: Tensor, xy: Tensor, x_edges: Tensor, y_edges: Tensor
+) -> tuple[Tensor, ...]:
     """∂P by x, y, half, xx, yy and xy (..., rows, columns)."""
     det, (across, along) = _determinant(xx, xy, yy), _sides(x, x_edges, y, y_edges, half)
     by_x, by_y = _edges(across, along, xx, xy, det), _edges(along, across, yy, xy, det)
     return by_x[0], by_y[0], by_x[1] + by_y[1], 0.5 * by_x[2], 0.5 * by_y[2], by_x[3]
 
 
-def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+def _energy(across: Side, along: Side, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     """P by the product rule where half a pixel is no wider than 1.5 conditional σ, else by `_rule`."""
     det = _determinant(xx, xy, yy)
     if any(map(is_wrapped, (*across, *along, xx, xy, yy))):
@@ -188,7 +204,7 @@ def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> 
     return energy.unflatten(0, batch) if batch else energy[0]
 
 
-def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
+def _product_rule(across: Side, along: Side, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
     """∬ p dx dy over narrow pixels by Gauss nodes ξ, η of [-1, 1] about their centre (x, y), with Λ = Σ⁻¹:
 
         P = 4h² √det Λ/2π e^(-E) Σ_k c^k/k! Σ_ξ w ξ^k e^(-αhξ - Λxx h²ξ²/2) Σ_η w η^k e^(-βhη - Λyy h²η²/2)
@@ -229,7 +245,7 @@ def _count_nodes(width: int, slope: int) -> int:
 
     def integral(count: int, a: float) -> np.longdouble:
         s, weight = _gauss(count)
-        return weight @ np.exp(-a * (s + 1) - 0.5 * (b * s) ** 2)
+        return np.dot(weight, np.exp(-a * (s + 1) - 0.5 * (b * s) ** 2))
 
     def serves(count: int) -> bool:
         return all(abs(integral(count, a) / integral(count + 12, a) - 1) <= error for a, error in cases)
@@ -248,7 +264,7 @@ def _gauss_moments(nodes: int, terms: int) -> tuple[np.ndarray, np.ndarray]:
 @functools.cache
 def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre nodes and weights 2/((1 - x²) P'(x)²), in long double: numpy's err by 4e-14 of a weight."""
-    x = legendre.leggauss(count)[0].astype(np.longdouble)
+    x: np.ndarray = legendre.leggauss(count)[0].astype(np.longdouble)
     for _ in range(3):
         before, now = np.ones_like(x), x
         for n in range(2, count + 1):
@@ -276,7 +292,7 @@ def _determinant(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     return (plain - plain.detach()) + ((p - q) + (dp - dq)).clamp_min(0.0)
 
 
-def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor) -> tuple[Tensor, ...]:
+def _edges(side: Side, other: Side, variance: Tensor, xy: Tensor, det: Tensor) -> tuple[Tensor, ...]:
     """E₁ - E₀, E₁ + E₀, E′₁ - E′₀ and C₁ - C₀ of the edges x₀, x₁ of a pixel.
 
     E(x) = ∫ p dy and E′(x) = ∫ ∂p/∂x dy over an edge, C(x): p at its upper end less p at its lower end.
@@ -288,7 +304,7 @@ def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor)
     for x in side[:2]:
         shift = slope * x
         density.append(_density(x, sigma))
-        strip.append(_interval(lower - shift, upper - shift, middle - shift, half_width, s))
+        strip.append(_interval((lower - shift, upper - shift, middle - shift, half_width), s))
         ends.append(density[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
         energy.append(density[-1] * strip[-1])
         tilt.append(-(safe_divide(x, torch.broadcast_tensors(variance, x)[0]) * energy[-1]) - slope * ends[-1])
@@ -302,7 +318,7 @@ def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor)
     return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
 
 
-def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
+def _rule(across: Side, along: Side, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
     """∫ φ(u) [Φ((y₁ - ρu)/r) - Φ((y₀ - ρu)/r)] du over a pixel, r² = 1 - ρ², all over σ; a Gaussian rule in pieces.
 
     The integrand is log-concave with its peak at u*, the point of the pixel nearest to the centroid in the norm of Σ:
@@ -333,9 +349,9 @@ def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Te
         length = 0.5 * (end - start)
         u = origin + (start + (1 + nodes) * length)
         shift = rho * u
-        strip = _interval(y0 - shift, y1 - shift, y - shift, y_half, r)
+        strip = _interval((y0 - shift, y1 - shift, y - shift, y_half), r)
         total = total + length * (weights * (_bell(u) * strip)).sum(0)
-    straight = _interval(*across, sigma_x) * _interval(*along, sigma_y)
+    straight = _interval(across, sigma_x) * _interval(along, sigma_y)
     return torch.where(xy == 0, straight, total)
 
 
@@ -403,7 +419,7 @@ def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
     """Gaussians of the rays through pupil points (2, P), all of one weight: their centroid and covariance, not those of
     all light."""
     traced = trace_scene(scene, points)
-    arrives = torch.where(traced.valid, 1 / points.shape[1], 0.0).expand(*scene.shape, -1)
+    arrives = (traced.valid.to(traced.position) / points.shape[1]).expand(*scene.shape, -1)
     centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
     # Points with their mirror images in x have no covariance xy but for rounding, which would cost a quadrature.
     mirrored = points * points.new_tensor([[-1.0], [1.0]])
@@ -490,21 +506,20 @@ def residual(light: Light, grid: Grid, shape: Tensor, order: int, fold: str) -> 
             points = _unfold(light.hits, order, fold) @ matrix.to(light.hits.dtype).mT
             weights = torch.ones_like(points[0])
         else:
-            points, weights = _points_of_arms(light, fold)
+            points, weights = _points_of_arms(light.hits, light.arms, fold)
         h = histogram(grid, points, safe_divide(weights, weights.sum(-1, keepdim=True).expand_as(weights)))
         return safe_divide((h - shape).abs().sum((-2, -1)), h.sum((-2, -1)))
 
 
-def _points_of_arms(light: Light, fold: str) -> tuple[Tensor, Tensor]:
+def _points_of_arms(hits: Tensor, arms: Arms, fold: str) -> tuple[Tensor, Tensor]:
     """Hits (2, ..., P) of many nodes in every clear part of an arm, and weights, by interpolation along it."""
-    arms = light.arms
     parts = arms.inner.shape[-1]
-    rings = light.hits.shape[-1] // parts
+    rings = hits.shape[-1] // parts
     fine = (np.arange(_MAP_NODES) + 0.5) / _MAP_NODES
     nodes, fitted = (legendre.legvander(x, rings - 1) for x in (2 * fine - 1, legendre.leggauss(rings)[0]))
-    points = light.hits.new_tensor(nodes @ np.linalg.inv(fitted)) @ light.hits.unflatten(-1, (rings, parts))
+    points = hits.new_tensor(nodes @ np.linalg.inv(fitted)) @ hits.unflatten(-1, (rings, parts))
     inner, length = arms.inner[..., None, :], (arms.outer - arms.inner)[..., None, :]
-    weights = (inner + length * light.hits.new_tensor(fine)[:, None]) * length * arms.share[..., None, :]
+    weights = (inner + length * hits.new_tensor(fine)[:, None]) * length * arms.share[..., None, :]
     if fold == "round":
         angle = torch.arange(_MAP_ARMS, dtype=points.dtype, device=points.device) * (2 * math.pi / _MAP_ARMS)
         points = torch.stack([points[1, ..., None] * torch.cos(angle), points[1, ..., None] * torch.sin(angle)])

@@ -12,7 +12,7 @@ import itertools
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,12 +20,26 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.budget import OverBudget, afford, within
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
+from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.sampling import Grid, gauss_rings, sobol
 from raytrace.maths.sampling import grid as make_grid
 from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
 from raytrace.psf_models.dft import TooManyPoints
-from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
+from raytrace.psf_models.result import (
+    DRT,
+    EmptyPsf,
+    Fourier,
+    Gaussian,
+    Kernels,
+    Parameters,
+    Paraxial,
+    Psf,
+    Wave,
+    combined,
+    mixture,
+    polychromatic,
+    without_dark,
+)
 from raytrace.shards import Share, agreeing, gathered, total
 from raytrace.system.lens import Lens, field_points, one_lens, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
@@ -37,58 +51,6 @@ from raytrace.words import RaytraceWarning, calling_level, option
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 _PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
-
-
-@value
-class Paraxial:
-    """First-order data: a Gaussian of the defocus blur. rho: its σ over the blur radius; order: 0, for loops."""
-
-    rho: Tensor | float = 0.5
-    order: int | None = None
-
-
-@value
-class Fourier:
-    """First-order data with diffraction: a circular pupil, defocused and aberrated.
-
-    zernike: Noll coefficients from 1 on, mm RMS of path, (J,) or (J, D, F, W); order: -2 … 5, for loops.
-    """
-
-    zernike: Tensor | None = None
-    order: int | None = None
-
-
-@value
-class Gaussian:
-    """A Gaussian of the centroid and covariance of traced rays.
-
-    rays: at most so many per kernel, or their pupil points (2, P), all of one weight: a Gaussian of twelve rays has
-    their centroid and covariance, not those of all light; order: instead, Gauss rings, 2, 3, 4, 5, 6, 8, 10, 12, 16 or
-    24, for loops.
-    """
-
-    rays: int | Tensor | None = None
-    order: int | None = None
-
-
-@value
-class DRT:
-    """All traced rays: geometric optics.
-
-    rays: independent Sobol rays per kernel, or their pupil points (2, P), all of one weight; order: instead, 0 … 10,
-    for loops.
-    """
-
-    rays: int | Tensor | None = None
-    order: int | None = None
-
-
-@value
-class Wave:
-    """Diffraction of the traced wavefront. rays: at most so many per kernel; order: instead, -2 … 5, for loops."""
-
-    rays: int | None = None
-    order: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +67,7 @@ class Execution:
     memo: Memo | None = None
     share: Share | None = None
     max_bytes: float | None = None
-    progress: Callable | None = None
+    progress: Callable[[int, str], contextlib.AbstractContextManager[Any]] | None = None
     empty: str = "nan"
 
 
@@ -118,8 +80,8 @@ class Model:
     parameters: the class of its numbers, as `psf` takes them; those other than order and rays are keywords of
         `kernels`.
     lean: `kernels` without the residual, where that costs time.
-    plain: (scene, grid, rays=…) -> Kernels of independent rays, where the model has such.
-    of_points: (scene, grid, points) -> Kernels of the rays through pupil points (2, P), where the model has such.
+    plain: (scene, grid, rays=…) -> Kernels of independent rays; None for models without them.
+    of_points: (scene, grid, points) -> Kernels of the rays through pupil points (2, P); None for models without them.
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
         alone and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
@@ -142,7 +104,7 @@ class Model:
     title: str
     kernels: Callable[..., Kernels]
     orders: Sequence[int]
-    parameters: type
+    parameters: type[Parameters]
     lean: Callable[..., Kernels] | None = None
     plain: Callable[..., Kernels] | None = None
     of_points: Callable[[Scene, Grid, Tensor], Kernels] | None = None
@@ -164,14 +126,14 @@ class Model:
 
 
 # fourier and wave use the same sums; torch's J₀ is accurate to 3e-7 only.
-_OF_WAVES = {"waves": True, "first": 0.23, "least": 1e-3, "most": 0.5, "floor": 1e-7, "compared": {"tol": 1e-3}}
+_wave_model = functools.partial(Model, waves=True, first=0.23, least=1e-3, most=0.5, floor=1e-7, compared={"tol": 1e-3})
 
 # fmt: off
 _ROWS = (
     # First-order data: a Gaussian of the defocus blur.
     Model("paraxial", "paraxial", paraxial.kernels, (0,), Paraxial, traces=False, is_rung=True, row=2),
     # The same with diffraction: a defocused (and aberrated) circular pupil.
-    Model("fourier", "Fourier", fourier.kernels, range(-2, 6), Fourier, traces=False, row=3, **_OF_WAVES),
+    _wave_model("fourier", "Fourier", fourier.kernels, range(-2, 6), Fourier, traces=False, row=3),
     # Centroid and covariance of traced rays. Gauss rings converge irregularly: the change of one order does not predict
     # that of the next, so the error is proven.
     Model(
@@ -187,7 +149,7 @@ _ROWS = (
         first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
-    Model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_rung=True, by_field=True, row=4, **_OF_WAVES),
+    _wave_model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_rung=True, by_field=True, row=4),
 )
 # fmt: on
 
@@ -201,10 +163,10 @@ def is_sampled_in_common(lens: Lens, model: str) -> bool:
 
 
 class NotConverged(RaytraceWarning):
-    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
+    """A PSF whose estimated error stays above the tolerance at the finest order."""
 
 
-def model_of(name: str, **numbers) -> Paraxial | Fourier | Gaussian | DRT | Wave:
+def model_of(name: str, **numbers: Any) -> Parameters:
     """A model with its numbers, by its name. Raises ValueError for an unknown name or number."""
     if name == "auto" and "rays" in numbers:
         raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
@@ -225,7 +187,7 @@ def name_of(parameters: Paraxial | Fourier | Gaussian | DRT | Wave) -> str:
 
 def psf(
     lens: Lens,
-    model: str | Paraxial | Fourier | Gaussian | DRT | Wave = "auto",
+    model: str | Parameters = "auto",
     *,
     fields: Tensor | Sequence | None = None,
     object_distances: Tensor | Sequence[float] | None = None,
@@ -282,7 +244,9 @@ def psf(
     }.items():
         if word not in words:
             raise ValueError(f"{parameter} {word!r} is not known; expected {', '.join(words)}")
-    parameters = MODELS[name].parameters() if isinstance(model, str) and name != "auto" else model
+    parameters: Parameters | None = None  # of "auto"
+    if name != "auto":
+        parameters = MODELS[name].parameters() if isinstance(model, str) else model
     order, rays = (getattr(parameters, number, None) for number in ("order", "rays"))
     points = rays if isinstance(rays, Tensor) else None
     for wrong, message in (
@@ -354,7 +318,7 @@ def psf(
             pass
         elif center == "centroid":
             alone = gaussian.kernels_alone(batch, make_grid(batch.wavelengths.new_tensor(1.0), 1), order=6)
-            origin = polychromatic(alone, shares, "").centroid
+            origin = polychromatic(alone, batch, shares, "").centroid
         else:
             origin = chief_landing(dataclasses.replace(batch, wavelengths=part.primary[None]))[..., 0]
         if origin is not None and window == "fixed":
@@ -391,9 +355,11 @@ def psf(
         dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
         for number, (distance, failed) in enumerate(zip(distances.detach(), dark, strict=True)):
             where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
-            at = where if len(distances) > 1 else ""
+            prefix = where if len(distances) > 1 else ""
             trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
-            warn_of_failures(trial, trials, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+            warn_of_failures(
+                trial, trials, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), prefix=prefix
+            )
     return dataclasses.replace(
         psfs,
         lens=lens,
@@ -401,18 +367,20 @@ def psf(
         object_distances=distances,
         wavelengths=wavelengths,
         wavelength_weights=shares,
-        parameters=MODELS[psfs.model].parameters() if name == "auto" else parameters,
+        parameters=parameters or MODELS[psfs.model].parameters(),
         framed=(grid, pixel, size) != (None, None, None),
     )
 
 
-def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution) -> Callable[..., Psf]:
+def _driver(
+    lens: Lens, name: str, parameters: Parameters | None, tol: float, execution: Execution
+) -> Callable[..., Psf]:
     """The function (scene, grid, weights) -> Psf that the arguments of `psf` select."""
     share = execution.share if execution.share is not None and execution.share.processes > 1 else None
     if share is not None:
         check_shares(lens, parameters)
 
-    def configured(row: Model, numbers) -> Model:
+    def configured(row: Model, numbers: Parameters) -> Model:
         keywords = {field.name: getattr(numbers, field.name) for field in dataclasses.fields(numbers)}
         keywords = {key: number for key, number in keywords.items() if key not in ("order", "rays")}
         row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **keywords)) if keywords else row
@@ -422,26 +390,26 @@ def _driver(lens: Lens, name: str, parameters, tol: float, execution: Execution)
         plain = row.plain and functools.partial(plain_rays_shared, row.plain, share)
         return dataclasses.replace(row, kernels=deal(row.kernels), lean=row.lean and deal(row.lean), plain=plain)
 
-    if name == "auto":
+    if parameters is None:
         rungs = [row for row in _ROWS if row.is_rung and (row.traces or paraxial.has_one_focus(lens))]
         return functools.partial(climb, rungs=[configured(row, row.parameters()) for row in rungs], tol=tol)
     model = configured(MODELS[name], parameters)
     if parameters.order is not None:
         return functools.partial(by_order, model=model, order=parameters.order)
-    if getattr(parameters, "rays", None) is None:
+    rays, max_bytes = getattr(parameters, "rays", None), execution.max_bytes
+    if rays is None:
         return functools.partial(by_tolerance, model=model, tol=tol)
-    if isinstance(parameters.rays, Tensor):
-        return functools.partial(by_points, model=model, points=parameters.rays)
-    rays = int(parameters.rays)
-    if execution.max_bytes is None or model.plain is None:
-        return functools.partial(by_rays, model=model, count=rays)
+    if isinstance(rays, Tensor):
+        return functools.partial(by_points, model=model, points=rays)
+    if max_bytes is None or model.plain is None:
+        return functools.partial(by_rays, model=model, count=int(rays))
 
     def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
         bars = execution.progress
-        with bars(rays * math.prod(batch.shape), "ray") if bars else contextlib.nullcontext() as bar:
+        with bars(int(rays) * math.prod(batch.shape), "ray") if bars else contextlib.nullcontext() as bar:
             update = bar and bar.update
-            halves = drt.stream_kernels(batch, pixels, rays, max_bytes=execution.max_bytes, progress=update)
-        return _of_halves(*halves, weights, MODELS[name])
+            whole, half = drt.stream_kernels(batch, pixels, int(rays), max_bytes=max_bytes, progress=update)
+        return _of_halves(whole, half, batch, weights, MODELS[name])
 
     return stream
 
@@ -481,21 +449,24 @@ def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, o
     return _at(order, model.lean or model.kernels, batch, pixels, weights, model)
 
 
-def _at(order: int, kernels: Callable[..., Kernels], batch: Scene, pixels: Grid, weights: Tensor | None, model: Model):
-    psfs = polychromatic(kernels(batch, pixels, order=order), weights, model.name)
+def _at(
+    order: int, kernels: Callable[..., Kernels], batch: Scene, pixels: Grid, weights: Tensor | None, model: Model
+) -> Psf:
+    psfs = polychromatic(kernels(batch, pixels, order=order), batch, weights, model.name)
     return dataclasses.replace(psfs, order=order)
 
 
 def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, tol: float) -> Psf:
     """Raise the order until the estimated error meets the tolerance; see `_estimate`. Warns NotConverged."""
     with torch.no_grad():
-        before, changes = None, []
+        before: Psf | None = None
+        changes: list[Tensor] = []
         for order in model.orders:
             psfs = _at(order, model.kernels, batch, pixels, weights, model)
             if before is not None:
                 changes.append(_change(before, psfs, model))
             rounding = _rounding(batch, pixels, psfs, model)
-            if model.proof is not None and changes:
+            if model.proof is not None and before is not None:
                 error = model.proof * changes[-1] + rounding
                 if bool((error <= tol).all()):
                     psfs = before
@@ -508,25 +479,28 @@ def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Mode
     if not bool((error <= tol).all()):
         reason = f"{model.name}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
         warnings.warn(reason, NotConverged, stacklevel=calling_level())
-    residual, order = psfs.residual, psfs.order
+    residual, chosen = psfs.residual, psfs.order
     # Derivatives by any number of the scene, the pixels or the model.
     numbers = pytree.tree_leaves((batch, pixels, weights, getattr(model.kernels, "keywords", {})))
-    if torch.is_grad_enabled() and any(varies(number) for number in numbers):
-        psfs = by_order(batch, pixels, weights, model, order)
+    if chosen is not None and torch.is_grad_enabled() and any(varies(number) for number in numbers):
+        psfs = by_order(batch, pixels, weights, model, chosen)
     return dataclasses.replace(psfs, error=error, residual=residual, reason=reason)
 
 
 def by_points(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, points: Tensor) -> Psf:
     """The kernels of the rays through pupil points (2, P), without error estimate."""
-    return polychromatic(model.of_points(batch, pixels, points.to(batch.fields)), weights, model.name)
+    if model.of_points is None:
+        raise ValueError(f"{model.name} takes a number of rays, not pupil points")
+    return polychromatic(model.of_points(batch, pixels, points.to(batch.fields)), batch, weights, model.name)
 
 
 def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, count: int) -> Psf:
     """About `count` rays per kernel; the error is the change from half as many."""
     if model.plain is not None:
-        halves = (model.plain(batch, pixels, rays=n) for n in (count, max(count // 2, 1)))
-        return _of_halves(*halves, weights, model)
-    before, coarser = None, None
+        whole, half = (model.plain(batch, pixels, rays=n) for n in (count, max(count // 2, 1)))
+        return _of_halves(whole, half, batch, weights, model)
+    before: Psf | None = None
+    coarser: Psf | None = None
     for order in model.orders:
         psfs = _at(order, model.kernels, batch, pixels, weights, model)
         if psfs.rays > count:
@@ -537,10 +511,10 @@ def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, co
     return before if coarser is None else dataclasses.replace(before, error=_change(coarser, before, model).detach())
 
 
-def _of_halves(whole: Kernels, half: Kernels, weights: Tensor | None, model: Model) -> Psf:
+def _of_halves(whole: Kernels, half: Kernels, batch: Scene, weights: Tensor | None, model: Model) -> Psf:
     """The PSF of independent rays; its error is the change from half as many."""
-    whole, half = (polychromatic(kernels, weights, model.name) for kernels in (whole, half))
-    return dataclasses.replace(whole, error=_kernel_change(half, whole).detach())
+    psfs, coarser = (polychromatic(kernels, batch, weights, model.name) for kernels in (whole, half))
+    return dataclasses.replace(psfs, error=_kernel_change(coarser, psfs).detach())
 
 
 def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
@@ -586,7 +560,7 @@ def _estimate(model: Model, changes: list[Tensor], psfs: Psf, rounding: Tensor) 
         rho = torch.full_like(psfs.energy, model.first)
     else:
         return torch.full_like(psfs.energy, torch.inf)
-    unseen = model.unseen * psfs.residual if model.unseen else 0.0
+    unseen = model.unseen * psfs.residual if model.unseen and psfs.residual is not None else 0.0
     return model.margin * changes[-1] * rho / (1 - rho) + unseen + rounding
 
 
@@ -620,7 +594,7 @@ def _kernel_change(before: Psf, after: Psf) -> Tensor:
     return safe_divide((before.kernel - after.kernel).abs().sum((-2, -1)), after.energy)
 
 
-def check_shares(lens: Lens, parameters) -> None:
+def check_shares(lens: Lens, parameters: Parameters | None) -> None:
     """Raise ValueError for derivatives and for options that differ between kernels: processes cannot share them."""
     leaves = [leaf for leaf in pytree.tree_leaves((lens, parameters)) if isinstance(leaf, Tensor)]
     if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
@@ -635,7 +609,7 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
     by_field: decisions are made for each field alone: either whole fields are dealt out, or each field is divided.
     """
 
-    def compute(scene: Scene, grid: Grid, **options) -> Kernels:
+    def compute(scene: Scene, grid: Grid, **options: Any) -> Kernels:
         cut = _cuts(scene.shape, share.processes, by_field=by_field)
         if math.prod(cut) == 1:
             return kernels(scene, grid, **options)
@@ -672,19 +646,22 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
 def plain_rays_shared(plain: Callable[..., Kernels], share: Share, scene: Scene, grid: Grid, *, rays: int) -> Kernels:
     """Kernels of `rays` Sobol rays, each process tracing a share of them."""
 
-    def some(count: int, **like) -> tuple[Tensor, Tensor]:
+    def some(count: int, **like: Any) -> tuple[Tensor, Tensor]:
         points, weights = sobol(count, **like)
         return points[:, share.part(count)], weights[share.part(count)]
 
     light = plain(scene, grid, rays=rays, sampling=some)
-    arrived, *moments = (gathered(t).movedim(0, -1) for t in (light.arrived, light.centroid, light.covariance))
-    centroid, covariance = mixture(arrived, *moments)
+    assert light.arrived is not None  # as of independent rays
+    arrived, centroid, covariance = (
+        gathered(t).movedim(0, -1) for t in (light.arrived, light.centroid, light.covariance)
+    )
+    centroid, covariance = mixture(arrived, centroid, covariance)
     return dataclasses.replace(
         light, kernel=total(light.kernel), arrived=arrived.sum(-1), centroid=centroid, covariance=covariance
     )
 
 
-def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int, int, int]:
+def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int, ...]:
     """Number of parts along each axis that minimises the largest block; of equal ones the fewest parts."""
     choices = itertools.product(*(range(1, min(count, processes) + 1) for count in shape))
     fitting = [cut for cut in choices if math.prod(cut) <= processes]

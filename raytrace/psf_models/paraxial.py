@@ -12,7 +12,7 @@ from raytrace.system.lens import Lens, media
 from raytrace.system.surface import is_round
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.launch import is_at_infinity, object_field
-from raytrace.tracing.paraxial import chief_ray, first_order, signed, system_matrix
+from raytrace.tracing.paraxial import axial_beam, chief_ray, first_order, signed, system_matrix
 from raytrace.tracing.scene import Scene, is_on_axis
 from raytrace.tracing.trace import Bent, is_bent, need_axis
 
@@ -61,7 +61,7 @@ def blur_radius(scene: Scene) -> Tensor:
     """ε = R |1 - z_i (1/f - 1/z_o)|, (D, 1, W) mm; derivative 0 in focus.
 
     R: radius of the entrance pupil; z_i: from the rear principal plane to the sensor, z_o: from the object to the
-    front one, both along the light. In media 1/z_o is n/n′ of it.
+    front one, both along the light. In media other than air 1/z_o is multiplied by n/n′.
     """
     lens = scene.lens
     wavelengths = scene.wavelengths
@@ -79,9 +79,9 @@ def chief_ray_height(scene: Scene) -> Tensor:
     lens, wavelengths = scene.lens, scene.wavelengths
     if is_on_axis(scene):
         return wavelengths.new_zeros(2, *scene.shape)
-    paraxial = first_order(lens)
-    field, _ = object_field(lens, scene.fields[:, :, None], paraxial)
-    distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
+    beam = axial_beam(lens)
+    field, _ = object_field(lens, scene.fields[:, :, None], beam)
+    distance, pupil = lens.surfaces[0].thickness, beam.entrance_pupil_position
     n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
     A, B, C, D = system_matrix(lens.surfaces[1:-1], n, wavelengths)
     to_sensor = lens.surfaces[-2].thickness / n[-1]

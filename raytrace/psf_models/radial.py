@@ -118,7 +118,7 @@ def unfold(grid: Grid, values: Tensor) -> Tensor:
     return values[..., index]
 
 
-def _offsets(rows: int, columns: int) -> list[np.ndarray]:
+def _offsets(rows: int, columns: int) -> Sequence[np.ndarray]:
     """y and x (rows, columns) of the centres of the pixels, in pixels."""
     return np.meshgrid(*(np.arange(n) - 0.5 * (n - 1) for n in (rows, columns)), indexing="ij")
 
@@ -143,7 +143,7 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     places = _distinct(rows, columns)[0]
     forewarn(
         5e-9 * count * len(places) * nodes**2,
-        f"a PSF takes its light at {count:,} radii and {nodes:,}² points of each pixel",
+        f"a PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
         helps="ask for a smaller {size} or {pixel}, a slower aperture ({f_number}) or {model=drt}",
     )
     x, y = (places[:, axis, None] + node for axis in (0, 1))

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from os import PathLike
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +13,9 @@ from raytrace.files import write_atomically
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
 from raytrace.maths.sampling import Grid
+from raytrace.plotting.style import Figure
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import Scene
 from raytrace.words import RaytraceError
 
 #: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
@@ -25,6 +28,62 @@ class EmptyPsf(RaytraceError, ValueError):
 
 
 @value
+class Paraxial:
+    """First-order data: a Gaussian of the defocus blur. rho: its σ over the blur radius; order: 0, for loops."""
+
+    rho: Tensor | float = 0.5
+    order: int | None = None
+
+
+@value
+class Fourier:
+    """First-order data with diffraction: a circular pupil, defocused and aberrated.
+
+    zernike: Noll coefficients from 1 on, mm RMS of path, (J,) or (J, D, F, W); order: -2 … 5, for loops.
+    """
+
+    zernike: Tensor | None = None
+    order: int | None = None
+
+
+@value
+class Gaussian:
+    """A Gaussian of the centroid and covariance of traced rays.
+
+    rays: at most so many per kernel, or their pupil points (2, P), all of one weight: a Gaussian of twelve rays has
+    their centroid and covariance, not those of all light; order: instead, Gauss rings, 2, 3, 4, 5, 6, 8, 10, 12, 16 or
+    24, for loops.
+    """
+
+    rays: int | Tensor | None = None
+    order: int | None = None
+
+
+@value
+class DRT:
+    """All traced rays: geometric optics.
+
+    rays: independent Sobol rays per kernel, or their pupil points (2, P), all of one weight; order: instead, 0 … 10,
+    for loops.
+    """
+
+    rays: int | Tensor | None = None
+    order: int | None = None
+
+
+@value
+class Wave:
+    """Diffraction of the traced wavefront. rays: at most so many per kernel; order: instead, -2 … 5, for loops."""
+
+    rays: int | None = None
+    order: int | None = None
+
+
+#: A model with its numbers.
+Parameters = Paraxial | Fourier | Gaussian | DRT | Wave
+
+
+@value
 class Kernels:
     """PSFs of one model, one for each object distance, field and wavelength.
 
@@ -32,7 +91,6 @@ class Kernels:
     grid: its centre is (2,) or (2, D, F, W).
     centroid: (2, D, F, W) mm; covariance: (3, D, F, W) mm², xx, xy, yy, of the model's distribution before it is
         integrated over pixels; of waves, of the light inside the window: behind a hard edge the second moment diverges.
-        None where they are not computed.
     ray_centroid, ray_covariance: of waves, the same of their rays, whatever the window; else None.
     rays: number of rays traced for each kernel; 0 if none.
     residual: (D, F, W) error of the model itself (relative L1), or None where it has no estimate.
@@ -41,8 +99,8 @@ class Kernels:
 
     kernel: Tensor
     grid: Grid
-    centroid: Tensor | None
-    covariance: Tensor | None
+    centroid: Tensor
+    covariance: Tensor
     rays: int
     residual: Tensor | None = None
     ray_centroid: Tensor | None = None
@@ -57,7 +115,7 @@ class Kernels:
     @property
     def ray_moments(self) -> tuple[Tensor, Tensor]:
         """Centroid and covariance of geometric optics: of the rays of waves, else those of the model."""
-        if self.ray_centroid is None:
+        if self.ray_centroid is None or self.ray_covariance is None:
             return self.centroid, self.covariance
         return self.ray_centroid, self.ray_covariance
 
@@ -98,6 +156,11 @@ class Psf(Result):
     covariance: Tensor
     ray_centroid: Tensor
     ray_covariance: Tensor
+    lens: Lens
+    fields: Tensor
+    object_distances: Tensor
+    wavelengths: Tensor
+    wavelength_weights: Tensor
     residual: Tensor | None = None
     arrived: Tensor | None = None
     model: str = ""
@@ -106,12 +169,7 @@ class Psf(Result):
     rays: int = 0
     reason: str = ""
     normalised: str = "energy"
-    wavelengths: Tensor | None = None
-    wavelength_weights: Tensor | None = None
-    lens: Lens | None = None
-    fields: Tensor | None = None
-    object_distances: Tensor | None = None
-    parameters: object = None
+    parameters: Parameters | None = None
     framed: bool = True
 
     @property
@@ -119,7 +177,7 @@ class Psf(Result):
         """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
         return self.kernel.dim() == 4
 
-    def draw(self, **options):
+    def draw(self, **options: Any) -> Figure:
         """The kernels over object distance and field; options: as for `psf_models.figures.psf_grid`."""
         from raytrace.psf_models.figures import psf_grid
 
@@ -162,15 +220,18 @@ class Psf(Result):
         }
 
     def _entry(self, place: tuple[int, ...]) -> dict:
-        at = (slice(None), *place)
-        xx_xy_yy = {"covariance": self.covariance[at], "ray_covariance": self.ray_covariance[at]}
+        centroid, covariance, ray_centroid, ray_covariance = (
+            moment.movedim(0, -1)[place]
+            for moment in (self.centroid, self.covariance, self.ray_centroid, self.ray_covariance)
+        )
         return {
             "object_distance": number(self.object_distances[place[0]]),
             "field": numbers(self.fields[:, place[1]]),
             **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
-            "centroid": numbers(self.centroid[at]),
-            "ray_centroid": numbers(self.ray_centroid[at]),
-            **{key: [numbers(moments[:2]), numbers(moments[1:])] for key, moments in xx_xy_yy.items()},
+            "centroid": numbers(centroid),
+            "ray_centroid": numbers(ray_centroid),
+            "covariance": [numbers(covariance[:2]), numbers(covariance[1:])],
+            "ray_covariance": [numbers(ray_covariance[:2]), numbers(ray_covariance[1:])],
             "energy": number(self.energy[place]),
             "error": number(self.error[place]),
             "residual": None if self.residual is None else number(self.residual[place]),
@@ -179,8 +240,10 @@ class Psf(Result):
 
     def save(self, path: str | PathLike) -> None:
         """Write the arrays (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], and its axes."""
-        names = "energy", "error", "centroid", "covariance", "ray_centroid", "ray_covariance", "wavelengths"
-        names = *names, "wavelength_weights", "wavelengths_summed", "model", "normalised"
+        names = (
+            *("energy", "error", "centroid", "covariance", "ray_centroid", "ray_covariance", "wavelengths"),
+            *("wavelength_weights", "wavelengths_summed", "model", "normalised"),
+        )
         arrays = {name: getattr(self, name) for name in names}
         arrays |= {"psf": self.kernel, "centre": self.grid.centre, "object_distance": self.object_distances}
         arrays |= {"field": self.fields.T, "pixel_pitch": self.grid.pitch}
@@ -199,12 +262,12 @@ class Psf(Result):
 
     def _colours(self) -> str:
         """The wavelengths in words, and whether they are summed."""
-        named = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
+        colours = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
         if len(self.wavelengths) == 1:
-            return f"at {named} µm"
+            return f"at {colours} µm"
         shares = (self.wavelength_weights / self.wavelength_weights.max()).tolist()
-        shares = ":".join(f"{share:.3g}" for share in shares)
-        return f"summed over {named} µm by weights {shares}" if self.wavelengths_summed else f"each of {named} µm"
+        weights = ":".join(f"{share:.3g}" for share in shares)
+        return f"summed over {colours} µm by weights {weights}" if self.wavelengths_summed else f"each of {colours} µm"
 
 
 def _sigmas(covariance: Tensor) -> Tensor:
@@ -212,11 +275,14 @@ def _sigmas(covariance: Tensor) -> Tensor:
     return 1e3 * covariance[::2].clamp_min(0.0).sqrt()
 
 
-def combined(parts: Sequence, join: Callable[[list[Tensor], int], Tensor]):
+Light = TypeVar("Light", Kernels, Psf)
+
+
+def combined(parts: Sequence[Light], join: Callable[[list[Tensor], int], Tensor]) -> Light:
     """One Kernels or Psf of several of a kind: `join(tensors, axes before those of the batch)` of all their tensors."""
     names = [field.name for field in dataclasses.fields(parts[0]) if field.name in _BEFORE]
     names = [name for name in names if getattr(parts[0], name) is not None]
-    tensors = {name: join([getattr(part, name) for part in parts], _BEFORE[name]) for name in names}
+    tensors: dict[str, Any] = {name: join([getattr(part, name) for part in parts], _BEFORE[name]) for name in names}
     return dataclasses.replace(parts[0], rays=max(part.rays for part in parts), **tensors)
 
 
@@ -263,17 +329,21 @@ def mixture(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tenso
     Nothing large is subtracted (Chan, Golub and LeVeque, Stanford STAN-CS-79-773, 1979, eq. 2.1).
     """
     share = safe_divide(energy, energy.sum(-1, keepdim=True).expand(energy.shape))
-    mean, apart = centroid_and_covariance(*centroid, share)
+    mean, apart = centroid_and_covariance(centroid[0], centroid[1], share)
     return mean, apart + (share * covariance).sum(-1)
 
 
-def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
-    """Sum over wavelengths by their weights, with the moments of the sum of the distributions; None keeps each."""
+def polychromatic(kernels: Kernels, scene: Scene, weights: Tensor | None, model: str) -> Psf:
+    """Kernels of a scene summed over its wavelengths by their weights, with the moments of the sum of distributions.
+
+    Without weights every wavelength keeps its kernel.
+    """
     moments, rays = (kernels.centroid, kernels.covariance), kernels.ray_moments
     waves = kernels.ray_centroid is not None
     kernel, energy, residual, arrived = kernels.kernel, kernels.energy, kernels.residual, kernels.arrived
+    share = torch.ones_like(scene.wavelengths) if weights is None else weights
+    share = share / share.sum()
     if weights is not None:
-        share = weights / weights.sum()
         kernel = (share[:, None, None] * kernel).sum(-3)
         residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
         rays = mixture(torch.where(kernels.dark, 0.0, share), *rays)
@@ -282,21 +352,40 @@ def polychromatic(kernels: Kernels, weights: Tensor | None, model: str) -> Psf:
         energy = kernel.sum((-2, -1))
     centre = kernels.grid.centre if kernels.grid.centre.dim() == 1 else kernels.grid.centre[..., 0]
     grid, error = dataclasses.replace(kernels.grid, centre=centre), torch.full_like(energy.detach(), torch.nan)
-    light = {"residual": residual, "arrived": arrived, "model": model, "waves": waves, "rays": kernels.rays}
-    return Psf(kernel, grid, energy, error, *moments, *rays, **light)
+    return Psf(
+        kernel=kernel,
+        grid=grid,
+        energy=energy,
+        error=error,
+        centroid=moments[0],
+        covariance=moments[1],
+        ray_centroid=rays[0],
+        ray_covariance=rays[1],
+        lens=scene.lens,
+        fields=scene.fields,
+        object_distances=scene.lens.surfaces[0].thickness.flatten(),
+        wavelengths=scene.wavelengths,
+        wavelength_weights=share,
+        residual=residual,
+        arrived=arrived,
+        model=model,
+        waves=waves,
+        rays=kernels.rays,
+    )
 
 
 def without_dark(psfs: Psf, empty: str = "nan") -> Psf:
     """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
-    moments = {"centroid": psfs.centroid, "covariance": psfs.covariance}
-    moments |= {"ray_centroid": psfs.ray_centroid, "ray_covariance": psfs.ray_covariance}
     dark = _is_dark(psfs, psfs.ray_centroid, psfs.ray_covariance, of_waves=psfs.waves)
     if empty == "error" and bool(dark.any()):
         places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
         dark_of_all = f"{int(dark.sum())} of {dark.numel()}"
         raise EmptyPsf(f"no ray reaches the sensor in {dark_of_all} PSFs, those of index {places}")
-    shown = {name: torch.where(dark, torch.nan, moment) for name, moment in moments.items()}
-    return dataclasses.replace(psfs, **shown)
+    moments = psfs.centroid, psfs.covariance, psfs.ray_centroid, psfs.ray_covariance
+    centroid, covariance, ray_centroid, ray_covariance = (torch.where(dark, torch.nan, moment) for moment in moments)
+    return dataclasses.replace(
+        psfs, centroid=centroid, covariance=covariance, ray_centroid=ray_centroid, ray_covariance=ray_covariance
+    )
 
 
 def _is_dark(light: Kernels | Psf, centroid: Tensor, covariance: Tensor, *, of_waves: bool) -> Tensor:

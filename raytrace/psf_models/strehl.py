@@ -5,6 +5,7 @@ Newton's method climbs. Where nothing clips the pupil, the thousands of waves of
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -39,7 +40,7 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
 
 
 def _of_lens(scene: Scene, d: int, order: int) -> Tensor:
-    """The ratios (1, F, W) of one lens or object distance: the sampling of its light is its own."""
+    """The ratios (1, F, W) of one lens or object distance, whose light is sampled alone."""
     if scene.shape[0] > 1:
         scene = dataclasses.replace(scene, lens=one_lens(scene.lens, slice(d, d + 1)))
     return torch.cat([_of_field(one_field(scene, f), order) for f in range(scene.shape[1])], 1)
@@ -56,15 +57,18 @@ def _of_field(scene: Scene, order: int) -> Tensor:
     reach = (torch.linalg.vector_norm(high - low, dim=0) - blur).max()
     phase = phase_along_radius(probe, reach, scene.largest)
     smooth = _smooth_waves(scene, probe, phase, order + 1)
-    light = waves(scene, reach, order=order + 1, probe=probe) if smooth is None else None
+    if smooth is None:
+        light = coarse = waves(scene, reach, order=order + 1, probe=probe)
+    else:  # to find maxima it is enough that rays are dense for points half as far away
+        with torch.no_grad():
+            coarse = smooth(0.5 * phase)
     with torch.no_grad():
-        # To find maxima it is enough that rays are dense for points half as far away.
-        coarse = smooth(0.5 * phase) if light is None else light
         find = _highest_radii if coarse.symmetry == "round" else _highest_points
-        tops = [_climbed(coarse, x, y, width, 2) for x, y in zip(*find(coarse, low, high, width), strict=True)]
-        tops = torch.stack([torch.stack(top) for top in tops], 1)  # (2, K, D, F, W)
+        places = zip(*find(coarse, low, high, width), strict=True)
+        tops = torch.stack([torch.stack(_climbed(coarse, x, y, width, 2)) for x, y in places], 1)  # (2, K, D, F, W)
         farthest = torch.linalg.vector_norm(landing[:, None] - tops[..., None], dim=0) / width[..., None]
-    light = smooth(2 * math.pi * float(scene.largest(farthest.max()))) if light is None else light
+    if smooth is not None:
+        light = smooth(2 * math.pi * float(scene.largest(farthest.max())))
     with torch.no_grad():
         best = torch.stack([_intensity(light, *top) for top in tops.unbind(1)]).argmax(0, keepdim=True)
         x, y = (c.gather(0, best)[0] for c in tops)
@@ -97,8 +101,9 @@ def _climbed(light: Waves, x: Tensor, y: Tensor, width: Tensor, steps: int) -> t
             determinant = xx * yy - xy**2
             is_top = (xx < 0) & (determinant > 1e-6 * xx**2)
         full = safe_divide(yy * by_x - xy * by_y, determinant), safe_divide(xx * by_y - xy * by_x, determinant)
-        alone = (torch.where(own < 0, safe_divide(by, own), 0.0) for by, own in ((by_x, xx), (by_y, yy)))
-        moves = [torch.where(is_top, both, one).clamp(-longest, longest) for both, one in zip(full, alone, strict=True)]
+        alone = (torch.where(bend < 0, safe_divide(by, bend), 0.0) for by, bend in ((by_x, xx), (by_y, yy)))
+        pairs = zip(full, alone, strict=True)
+        moves = [torch.where(is_top, newton, along).clamp(-longest, longest) for newton, along in pairs]
         x, y = x - moves[0], y - moves[1]
     return x, y
 
@@ -131,13 +136,12 @@ def _highest_points(light: Waves, low: Tensor, high: Tensor, width: Tensor) -> t
         )
     field = field * dft.phasor((path + L * middle[0, ..., None]) / wavelength)
     u, v = (part * (step[..., None] / wavelength) for part in (L, M))
-    best = []
-    for each in zip(*(part.flatten(0, -2) for part in (field, u, v)), strict=True):
-        image = dft.on_lattice(*each, (rows, columns))
-        best.append(
-            torch.where(image == max_pool2d(image[None], 3, 1, 1)[0], image, -1.0).flatten().topk(_TOPS).indices
-        )
-    best = torch.stack(best, -1).reshape(_TOPS, *step.shape)
+    tops = []
+    for kernel, along_x, along_y in zip(*(part.flatten(0, -2) for part in (field, u, v)), strict=True):
+        image = dft.on_lattice(kernel, along_x, along_y, (rows, columns))
+        is_top = image == max_pool2d(image[None], 3, 1, 1)[0]
+        tops.append(torch.where(is_top, image, -1.0).flatten().topk(_TOPS).indices)
+    best = torch.stack(tops, -1).reshape(_TOPS, *step.shape)
     k, l = best % columns - columns // 2, best // columns - rows // 2
     return middle[0] + k * step, middle[1] + l * step
 
@@ -148,13 +152,13 @@ def _smooth_waves(scene: Scene, probe: Wavefront, phase: float, order: int) -> C
     Path and directions are Zernike series of rays on Gauss rings, where these polynomials are orthonormal. None for
     few waves or too many, where a ray fails, and where the series miss other rays by more than _MISSED waves.
     """
-    fold, like = symmetry(scene), {"dtype": probe.opd.dtype, "device": probe.opd.device}
+    fold, rule = symmetry(scene), functools.partial(gauss_rings, dtype=probe.opd.dtype, device=probe.opd.device)
     worth = _WORTH <= math.prod(dft.rings_and_arms(phase, order)) <= _MOST
     if fold == "round" or not worth or not scene.everywhere(probe.valid.all()):
         return None
     orders = [zernike.noll(j) for j in range(1, (_DEGREE + 1) * (_DEGREE + 2) // 2 + 1)]
-    points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, **like)
-    others = gauss_rings(_DEGREE // 2 + 3, 2 * _DEGREE + 7, **like)[0]
+    points, weights = rule(_DEGREE // 2 + 2, 2 * _DEGREE + 4)
+    others = rule(_DEGREE // 2 + 3, 2 * _DEGREE + 7)[0]
     front, fitted = wavefront_of(scene, torch.cat([points, others], 1)), len(weights)
     if not scene.everywhere(front.valid.all()) or is_clipped(scene):
         return None

@@ -73,8 +73,8 @@ def by_field(scene: Scene, grid: Grid, compute: Callable[[Scene, Grid], Kernels]
     """Kernels field by field, in double precision: in single precision the OPD itself is known to 1/400 wave only."""
     fields, centre = [], grid.centre
     for f in range(scene.shape[1]):
-        at = centre[:, :, f : f + 1] if centre.dim() > 1 and centre.shape[2] > 1 else centre
-        window = to(dataclasses.replace(grid, centre=at), dtype=torch.float64)
+        middle = centre[:, :, f : f + 1] if centre.dim() > 1 and centre.shape[2] > 1 else centre
+        window = to(dataclasses.replace(grid, centre=middle), dtype=torch.float64)
         fields.append(compute(one_field(scene, f), window))
     merged = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
     return dataclasses.replace(to(merged, dtype=grid.pitch.dtype), grid=grid)
@@ -233,12 +233,11 @@ def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -> tuple[Tensor, Tensor]:
     """Pupil points (2, P) and weights (P,), or (2, D, F, W, P) and (D, F, W, P) over the clear part of every arm."""
-    like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
     rings, whole = dft.rings_and_arms(phase, order)
     arms = whole
     if fold == "round":
         dft.afford_rings("the wave PSF", scene, rings, phase)
-        arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
+        arms, (points, weights) = 1, gauss_rings(rings, 1, dtype=probe.opd.dtype, device=probe.opd.device)
     else:
         points, weights = dft.disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
     unit = points[:, :arms] / torch.hypot(*points[:, :arms])
@@ -249,7 +248,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
         if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
     # Gaussian nodes between kinks are less dense in the middle than equal steps, by up to π/2; and an arm from a point
-    # beside the centre may be longer than 1, and the phase along it larger.
+    # off the centre may be longer than 1, and the phase along it larger.
     clear = arms_of(scene, math.ceil(1.25 * whole), fold)
     longest = scene.largest((clear.outer - clear.inner).detach().max().clamp_min(1.0))
     return clear.rule(math.ceil(rings * float(longest)))

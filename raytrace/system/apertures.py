@@ -5,13 +5,18 @@ in tracing/cpp/apertures.h.
 """
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt, value
+from raytrace.maths.numerics import Number, safe_sqrt, value
+
+#: Sizes of a shape, mm: floats, or scalar tensors.
+Sizes: TypeAlias = Sequence[Number]
 
 
 @value
@@ -32,26 +37,26 @@ class Aperture:
 
 
 class Edge(NamedTuple):
-    """An edge of a shape: points whose measure (...) is at most the limit lie within it, of an inner one at least.
+    """An edge of a shape: a point lies within it if its measure (...) is at most the limit; of an inner edge, at least.
 
-    size: what distances from it are counted in; by default the limit.
+    size: the unit of distances from the edge; by default the limit.
     """
 
     measure: Tensor
-    limit: float
+    limit: Number
     is_inner: bool = False
-    size: float | None = None
+    size: Number | None = None
 
     def within(self) -> Tensor:
-        """Which points (...) lie within, the edge itself included."""
+        """Whether points (...) lie within, the edge itself included."""
         return self.measure >= self.limit if self.is_inner else self.measure <= self.limit
 
     def strictly(self) -> Tensor:
-        """Which points (...) lie within, without the edge."""
+        """Whether points (...) lie within, without the edge."""
         return self.measure > self.limit if self.is_inner else self.measure < self.limit
 
     def distance(self) -> Tensor:
-        """How far within points (...) lie, smooth at the edge, in its own size; an edge at infinity is none."""
+        """The distance of points (...) from the edge, positive within, smooth at the edge, in units of `size`."""
         if self.size is not None:
             return (self.limit - self.measure) / self.size
         return self.measure / self.limit - 1 if self.is_inner else 1 - self.measure / self.limit
@@ -67,16 +72,16 @@ class Shape:
     or more points x, y; is_hollow: sizes -> whether light may be blocked inside it.
     """
 
-    edges: Callable[[Tensor, Tensor, Sequence[float]], list[Edge]]
-    reach: Callable[[Sequence[float]], tuple[float, float]]
+    edges: Callable[[Tensor, Tensor, Sizes], list[Edge]]
+    reach: Callable[[Sizes], tuple[Number, Number]]
     symmetry: str
     zemax: tuple[str, str]
     code: int | None = None
     sizes: int | None = 2
-    is_hollow: Callable[[Sequence[float]], bool] = lambda sizes: False
+    is_hollow: Callable[[Sizes], bool] = lambda sizes: False
 
-    def objection(self, sizes: Sequence[float]) -> str:
-        """Why these are no sizes of the shape; "" if they are."""
+    def objection(self, sizes: Sizes) -> str:
+        """Why a shape cannot have these sizes; "" if it can."""
         if self.sizes is None:
             return "" if len(sizes) >= 6 and len(sizes) % 2 == 0 else "has no points x, y, three or more"
         if len(sizes) != self.sizes:
@@ -84,13 +89,13 @@ class Shape:
         return "" if min(sizes) >= 0 else "has a negative size"
 
 
-def _rings(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+def _rings(x: Tensor, y: Tensor, sizes: Sizes) -> list[Edge]:
     square, (inner, outer) = x * x + y * y, sizes
     return [Edge(square, outer * outer), *([Edge(square, inner * inner, True)] if inner > 0 else [])]
 
 
-def _outlines(sizes: Sequence[float]) -> list[tuple[float, float, float, float]]:
-    """The sides (x1, y1, x2, y2) of polygons, each of which ends where its first point comes again, the last anyhow."""
+def _outlines(sizes: Sizes) -> list[tuple[Number, Number, Number, Number]]:
+    """The sides (x1, y1, x2, y2) of polygons; each is closed where its first point is repeated, the last one always."""
     points = list(zip(sizes[::2], sizes[1::2], strict=True))
     sides, first = [], 0
     for k in range(1, len(points)):
@@ -101,8 +106,8 @@ def _outlines(sizes: Sequence[float]) -> list[tuple[float, float, float, float]]
     return sides if first >= len(points) else [*sides, (*points[-1], *points[first])]
 
 
-def _polygons(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
-    """The signed distance from the nearest side; what lies within an odd number of polygons is inside."""
+def _polygons(x: Tensor, y: Tensor, sizes: Sizes) -> list[Edge]:
+    """The signed distance from the nearest side; points within an odd number of polygons are inside."""
     nearest, odd = torch.full_like(x, float("inf")), torch.zeros_like(x, dtype=torch.bool)
     for x1, y1, x2, y2 in _outlines(sizes):
         along_x, along_y = x2 - x1, y2 - y1
@@ -113,23 +118,25 @@ def _polygons(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
         if y1 != y2:
             odd = odd ^ (((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (along_x / along_y)))
     distance = safe_sqrt(nearest)
-    return [Edge(torch.where(odd, -distance, distance), 0.0, size=max(map(abs, sizes)))]
+    return [Edge(torch.where(odd, -distance, distance), 0.0, size=max(abs(size) for size in sizes))]
 
 
-def _box(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+def _box(x: Tensor, y: Tensor, sizes: Sizes) -> list[Edge]:
     return [Edge(x.abs(), sizes[0]), Edge(y.abs(), sizes[1])]
 
 
-def _reach_of_corners(sizes: Sequence[float]) -> tuple[float, float]:
-    return 0.0, max(map(abs, sizes[1::2]))
+def _reach_of_corners(sizes: Sizes) -> tuple[Number, Number]:
+    return 0.0, max(abs(size) for size in sizes[1::2])
 
 
-def _ellipse(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+def _ellipse(x: Tensor, y: Tensor, sizes: Sizes) -> list[Edge]:
     return [Edge((x / sizes[0]) ** 2 + (y / sizes[1]) ** 2, 1.0)]
 
 
 SHAPES = {
-    "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0),
+    "circular": Shape(
+        _rings, lambda sizes: (sizes[0], sizes[1]), "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0
+    ),
     "rectangular": Shape(_box, lambda sizes: (0.0, sizes[1]), "mirror", ("SQAP", "SQOB"), 1),
     "elliptic": Shape(_ellipse, lambda sizes: (0.0, sizes[1]), "mirror", ("ELAP", "ELOB"), 2),
     "polygon": Shape(_polygons, _reach_of_corners, "none", ("USAP", "USOB"), 3, None, is_hollow=lambda sizes: True),
@@ -137,41 +144,40 @@ SHAPES = {
 
 
 def edges(aperture: Aperture, hit: Tensor | Sequence[Tensor]) -> list[Edge]:
-    """The edges of an aperture as seen from points (2 or 3, ...) mm."""
+    """The edges of an aperture, measured at points (2 or 3, ...) mm."""
     x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
     return SHAPES[aperture.shape].edges(x, y, aperture.extent)
 
 
 def inside(apertures: Sequence[Aperture], hit: Tensor | Sequence[Tensor]) -> Tensor | None:
-    """Which points (...) pass all the apertures; None if there are none. An edge belongs to the clear side."""
-    passed = None
+    """Whether points (...) pass all the apertures; None without apertures. An edge belongs to the clear side."""
+    passed: Tensor | None = None
     for aperture in apertures:
         sides = [edge.strictly() if aperture.obscures else edge.within() for edge in edges(aperture, hit)]
-        within = sides[0] if len(sides) == 1 else sides[0] & sides[1]
+        within = functools.reduce(operator.and_, sides)
         clear = ~within if aperture.obscures else within
         passed = clear if passed is None else passed & clear
     return passed
 
 
 def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
-    """How far points (2, ...) lie on the clear side of an aperture's edge: smooth there, above 0 where light passes."""
-    first, *second = clearances_of(aperture, hit)
-    return torch.minimum(first, *second) if second else first
+    """The distance of points (2, ...) from the edge of an aperture, above 0 where light passes, smooth at the edge."""
+    return functools.reduce(torch.minimum, clearances_of(aperture, hit))
 
 
 def clearances_of(aperture: Aperture, hit: Tensor) -> list[Tensor]:
-    """The same of every edge by itself, where light must pass all of them; of an obscuration one for all."""
+    """`clearance` of every edge by itself, where light must pass all of them; of an obscuration that of all edges."""
     sides = [edge.distance() for edge in edges(aperture, hit)]
     if not aperture.obscures:
         return sides
-    return [-(sides[0] if len(sides) == 1 else torch.minimum(*sides))]
+    return [-functools.reduce(torch.minimum, sides)]
 
 
-def reach(aperture: Aperture) -> tuple[float, float]:
-    """From which to which distance along y from its centre, mm, the shape extends."""
+def reach(aperture: Aperture) -> tuple[Number, Number]:
+    """The smallest and largest |y| of the shape from its centre, mm."""
     return SHAPES[aperture.shape].reach(aperture.extent)
 
 
 def stands_inside(aperture: Aperture) -> bool:
-    """Whether an aperture can stop light in the midst of a beam whose rim it lets through."""
+    """Whether an aperture can block light inside a beam whose rim it passes."""
     return aperture.obscures or SHAPES[aperture.shape].is_hollow(aperture.extent)

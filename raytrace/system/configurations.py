@@ -6,22 +6,20 @@ are counted from 1.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from raytrace.materials.glass import Glass, label
-from raytrace.maths.numerics import value
-
-Whole = TypeVar("Whole")
+from raytrace.maths.numerics import Dataclass, value
 
 #: From a lens down to one of its parts: names of fields, positions in tuples, and a position (i, …) in a tensor.
 Path = tuple[str | int | tuple[int, ...], ...]
 
 
 class ScaledPath(NamedTuple):
-    """Where a lens holds the number of an operand: factor · number + offset, as a pickup has it."""
+    """The path of the number of an operand in a lens, which holds factor · number + offset, as for a pickup."""
 
     path: Path
     factor: float = 1.0
@@ -34,7 +32,7 @@ class Operand:
 
     name, number, parameter: of OpticStudio, "THIC" of surface `number`, "PRAM" of a surface and a parameter, "YFIE" of
         a field point; 0 where the operand has none.
-    paths: where the lens holds it; empty if it does not affect rays, as the weight of a configuration.
+    paths: of it in the lens; empty if it does not affect rays, as the weight of a configuration.
     numbers: (C,) as the lens holds them, mm or degrees, one per configuration; or media: a glass each; or words: for
         each configuration the contents of every path.
     refusal: why the operand is not supported; configurations in which it differs are refused.
@@ -43,10 +41,10 @@ class Operand:
     name: str
     number: int = 0
     parameter: int = 0
-    paths: tuple = ()
+    paths: tuple[ScaledPath, ...] = ()
     numbers: Tensor | None = None
     media: tuple[Glass, ...] = ()
-    words: tuple = ()
+    words: tuple[tuple, ...] = ()
     refusal: str = ""
 
     def __len__(self) -> int:
@@ -61,6 +59,22 @@ class Operand:
         if self.numbers is not None:
             return self.numbers.detach().tolist()
         return [label(glass) for glass in self.media] or [words[0] if words else "" for words in self.words]
+
+
+class Configured(Dataclass, Protocol):
+    """A lens with configurations."""
+
+    @property
+    def surfaces(self) -> tuple[Any, ...]: ...
+    @property
+    def wavelengths(self) -> Tensor: ...
+    @property
+    def operands(self) -> tuple[Operand, ...]: ...
+    @property
+    def current_configuration(self) -> int: ...
+
+
+Whole = TypeVar("Whole", bound=Configured)
 
 
 def count(operands: Sequence[Operand]) -> int:
@@ -82,8 +96,8 @@ def chosen(lens: Whole, number: int) -> Whole:
     """
     last = count(lens.operands)
     if not 1 <= number <= last:
-        there = f"has configurations 1 to {last}" if last > 1 else "has one configuration"
-        raise ValueError(f"configuration {number}: this lens {there}")
+        available = f"configurations 1 to {last}" if last > 1 else "one configuration"
+        raise ValueError(f"configuration {number}: this lens has {available}")
     for operand in lens.operands:
         shown = operand.values()
         if operand.refusal and shown[number - 1] != shown[lens.current_configuration - 1]:
@@ -98,10 +112,10 @@ def with_operands(lens: Whole, number: int) -> Whole:
         for position, (path, factor, offset) in enumerate(operand.paths):
             if operand.numbers is not None:
                 plain = (factor, offset) == (1.0, 0.0)
-                part = operand.numbers[k] if plain else factor * operand.numbers[k] + offset
+                new: Any = operand.numbers[k] if plain else factor * operand.numbers[k] + offset
             else:
-                part = operand.media[k] if operand.media else operand.words[k][position]
-            lens = with_part(lens, path, part)
+                new = operand.media[k] if operand.media else operand.words[k][position]
+            lens = with_part(lens, path, new)
     return dataclasses.replace(lens, current_configuration=number)
 
 
@@ -136,20 +150,21 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
             numbers = torch.as_tensor(values, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             path = ScaledPath(("surfaces", surface, name))
             operands.append(Operand(_NAMES[name], surface, paths=(path,), numbers=numbers))
-    if len({operand.numbers.shape for operand in operands}) > 1 or any(row.numbers.ndim != 1 for row in operands):
+    shapes = {operand.numbers.shape for operand in operands if operand.numbers is not None}
+    if len(shapes) > 1 or any(len(shape) != 1 for shape in shapes):
         raise ValueError("expected lists of values of one length, a value per configuration")
     return with_operands(dataclasses.replace(lens, operands=tuple(operands)), 1)
 
 
 def kept(lens: Whole) -> Whole:
-    """The lens whose operands have, for its current configuration, the numbers that it holds."""
+    """The lens whose operands have its current numbers as those of its current configuration."""
     operands = tuple(taken(operand, lens, lens.current_configuration - 1) for operand in lens.operands)
     return dataclasses.replace(lens, operands=operands)
 
 
-def freed(lens: Whole, **conditions) -> Whole:
-    """The lens without operands for what conditions of `Lens.at` set: a condition holds in every configuration."""
-    paths = {
+def freed(lens: Whole, **conditions: object) -> Whole:
+    """The lens without operands of the numbers that conditions of `Lens.at` set, which hold in every configuration."""
+    paths: dict[str, tuple[Path, ...]] = {
         "object_distance": (("surfaces", 0, "thickness"),),
         "sensor_distance": (("surfaces", len(lens.surfaces) - 2, "thickness"),),
         "f_number": (("aperture",),),
@@ -159,7 +174,7 @@ def freed(lens: Whole, **conditions) -> Whole:
         "wavelengths": (("wavelengths",), ("wavelength_weights",), ("primary_wavelength",)),
     }
     names = [name for name, condition in conditions.items() if condition is not None]
-    starts = [path for name in names for path in paths.get(name, ((name,),))]
+    starts: list[Path] = [path for name in names for path in paths.get(name, ((name,),))]
 
     def is_set(operand: Operand) -> bool:
         return any(scaled.path[: len(start)] == start for scaled in operand.paths for start in starts)
@@ -184,7 +199,7 @@ def taken(operand: Operand, lens: Whole, k: int) -> Operand:
 # -- parts of a value by their paths ----------------------------------------------------------------------------------
 
 
-def part(whole, path: Path):
+def part(whole: Any, path: Path) -> Any:
     """The part of a value at the end of a path; None where a part on the path is not modelled."""
     for step in path:
         if not _leads_on(whole, step):
@@ -193,65 +208,64 @@ def part(whole, path: Path):
     return whole
 
 
-def with_part(whole: Whole, path: Path, new, *, like=None) -> Whole:
+def with_part(whole: Any, path: Path, new: Any, *, like: Any = None) -> Any:
     """The value with another part at the end of a path; parts on the path that are not modelled are those of `like`."""
     if not path:
         return new
-    step, *rest = path
+    step: Any = path[0]
     if not _leads_on(whole, step):
         is_short = isinstance(whole, Tensor)
         whole = torch.cat([whole, whole.new_zeros(len(like) - len(whole))]) if is_short else like
     if isinstance(whole, Tensor):
         return with_entry(whole, step, new)
-    inner = with_part(part(whole, (step,)), tuple(rest), new, like=part(like, (step,)))
+    inner = with_part(part(whole, (step,)), path[1:], new, like=part(like, (step,)))
     if isinstance(step, str):
         return dataclasses.replace(whole, **{step: inner})
     return (*whole[:step], inner, *whole[step + 1 :])
 
 
-def _leads_on(whole, step: str | int | tuple[int, ...]) -> bool:
+def _leads_on(whole: Any, step: Any) -> bool:
     if isinstance(whole, Tensor):
         return len(step) == whole.ndim and all(k < size for k, size in zip(step, whole.shape, strict=True))
     return step < len(whole) if isinstance(whole, tuple) else whole is not None
 
 
-def differences(one, other, path: Path = ()) -> Iterator[Path]:
+def differences(a: Any, b: Any, path: Path = ()) -> Iterator[Path]:
     """The paths at which two values differ, as deep as both have parts; a glass is compared as a whole."""
-    if one is other:
+    if a is b:
         return
-    if type(one) is not type(other) or isinstance(one, Glass):
-        if type(one) is not type(other) or not same(one, other):
+    if type(a) is not type(b) or isinstance(a, Glass):
+        if type(a) is not type(b) or not same(a, b):
             yield path
-    elif isinstance(one, tuple) and len(one) == len(other) and type(one) is tuple:
-        for position, pair in enumerate(zip(one, other, strict=True)):
+    elif type(a) is tuple and len(a) == len(b):
+        for position, pair in enumerate(zip(a, b, strict=True)):
             yield from differences(*pair, (*path, position))
-    elif dataclasses.is_dataclass(one):
-        for field in dataclasses.fields(one):
-            yield from differences(getattr(one, field.name), getattr(other, field.name), (*path, field.name))
-    elif isinstance(one, Tensor) and one.shape == other.shape and one.ndim:
-        yield from ((*path, tuple(index)) for index in torch.nonzero(one != other).tolist())
-    elif not same(one, other):
+    elif dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            yield from differences(getattr(a, field.name), getattr(b, field.name), (*path, field.name))
+    elif isinstance(a, Tensor) and a.shape == b.shape and a.ndim:
+        yield from ((*path, tuple(index)) for index in torch.nonzero(a != b).tolist())
+    elif not same(a, b):
         yield path
 
 
-def same(one, other) -> bool:
+def same(a: Any, b: Any) -> bool:
     """Whether two parts of a value are equal, number by number."""
-    if isinstance(one, Tensor):
-        return isinstance(other, Tensor) and torch.equal(one, other)
-    if dataclasses.is_dataclass(one) and type(one) is type(other):
-        names = [field.name for field in dataclasses.fields(one)]
-        return all(same(getattr(one, name), getattr(other, name)) for name in names)
-    return one == other
+    if isinstance(a, Tensor) or isinstance(b, Tensor):
+        return isinstance(a, Tensor) and isinstance(b, Tensor) and torch.equal(a, b)
+    if dataclasses.is_dataclass(a) and type(a) is type(b):
+        return all(same(getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a))
+    return bool(a == b)
 
 
 def with_entry(numbers: Tensor, entry: tuple[int, ...], number: Tensor) -> Tensor:
     """A copy of a tensor with another number at one entry; numbers of L lenses (L, ...) have their axes behind it."""
     spread = spread_for(numbers, number, len(entry))
-    is_there = torch.zeros(spread.shape, dtype=torch.bool, device=numbers.device)
-    is_there[entry] = True
-    return torch.where(is_there, number, spread)
+    is_entry = torch.zeros(spread.shape, dtype=torch.bool, device=numbers.device)
+    is_entry[entry] = True
+    return torch.where(is_entry, number, spread)
 
 
 def spread_for(numbers: Tensor, number: Tensor, axes: int = 1) -> Tensor:
-    """Numbers with so many axes of their own, and trailing axes of length 1 for a number of L lenses."""
+    """Numbers with `axes` axes, and trailing axes of length 1 behind these for a number of L lenses."""
     return numbers.reshape(*numbers.shape, *(1,) * (number.dim() + axes - numbers.dim()))

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,15 +22,13 @@ _SHOWN = ("curvature", "thickness")  # of a surface, in its identity
 _DIGESTED = {"sag_terms": "departure", "paths": "places"}
 
 
-def identity(lens: Lens) -> dict:
+def identity(lens: Lens) -> dict[str, Any]:
     """The lens's name, the curvatures (1/mm), thicknesses (mm) and glasses of its surfaces, and two digests: of all
     numbers of the surfaces behind the object, and of the conditions, such as object distance, fields and wavelengths.
 
     Plain values, for JSON. A lens has one identity in float32 and float64: digests are of numbers to seven digits.
     """
-    surfaces = [
-        [*(number(getattr(one, name)) for name in _SHOWN), one.glass.name if one.glass else ""] for one in lens.surfaces
-    ]
+    surfaces = [[*(number(getattr(surface, name)) for name in _SHOWN), surface.glass.name] for surface in lens.surfaces]
     conditions = {field.name: getattr(lens, field.name) for field in dataclasses.fields(lens)} | {
         "surfaces": lens.surfaces[0]
     }
@@ -43,34 +42,32 @@ def identity(lens: Lens) -> dict:
 
 def digest(*values: object) -> str:
     """A digest of tensors, numbers, texts, and dataclasses and lists of them, but for their comments."""
-    found = hashlib.sha256()
-    _add(found, values)
-    return found.hexdigest()[:32]
+    hashed = hashlib.sha256()
+    _add(hashed, values)
+    return hashed.hexdigest()[:32]
 
 
-def _add(found, value: object) -> None:
+def _add(hashed: "hashlib._Hash", value: object) -> None:
     if isinstance(value, Tensor):
-        found.update(repr(tuple(value.shape)).encode())
+        hashed.update(repr(tuple(value.shape)).encode())
         numbers = value.detach().cpu()
         # + 0.0 makes -0 a 0
-        found.update((numbers.to(torch.float32) + 0.0).contiguous().numpy().tobytes())
+        hashed.update((numbers.to(torch.float32) + 0.0).contiguous().numpy().tobytes())
     elif isinstance(value, float):
-        _add(found, torch.tensor(value))
+        _add(hashed, torch.tensor(value))
     elif dataclasses.is_dataclass(value):
-        found.update(type(value).__name__.encode())
-        _add(
-            found,
-            {_DIGESTED.get(field.name, field.name): getattr(value, field.name) for field in dataclasses.fields(value)},
-        )
+        hashed.update(type(value).__name__.encode())
+        names = [field.name for field in dataclasses.fields(value)]
+        _add(hashed, {_DIGESTED.get(name, name): getattr(value, name) for name in names})
     elif isinstance(value, Mapping):
-        _add(found, [(name, one) for name, one in value.items() if name not in _WORDS])
+        _add(hashed, [(name, entry) for name, entry in value.items() if name not in _WORDS])
     elif isinstance(value, Sequence) and not isinstance(value, str):
-        found.update(b"[")
-        for one in value:
-            _add(found, one)
-        found.update(b"]")
+        hashed.update(b"[")
+        for entry in value:
+            _add(hashed, entry)
+        hashed.update(b"]")
     else:
-        found.update(f"{value!r};".encode())
+        hashed.update(f"{value!r};".encode())
 
 
 def other_lens(before: Mapping, now: Mapping) -> str:
@@ -78,20 +75,20 @@ def other_lens(before: Mapping, now: Mapping) -> str:
     if before["prescription"] == now["prescription"]:
         return ""
     names = before["lens"] or "a lens without a name", now["lens"] or "a lens without a name"
-    counts = [len(one["surfaces"]) - 1 for one in (before, now)]
+    counts = [len(lens["surfaces"]) - 1 for lens in (before, now)]
     if names[0] != names[1] or counts[0] != counts[1]:
         return f"{names[0]!r} of {counts[0]} surfaces, not {names[1]!r} of {counts[1]}"
     for k, (a, b) in enumerate(zip(before["surfaces"], now["surfaces"], strict=True)):
-        for quantity, one, other in zip((*_SHOWN, "glass"), a, b, strict=True):
-            if k and not alike(one, other):
-                return f"{names[0]!r} with {quantity} {_shown(one)} of surface {k}, not {_shown(other)}"
+        for quantity, stored, current in zip((*_SHOWN, "glass"), a, b, strict=True):
+            if k and not alike(stored, current):
+                return f"{names[0]!r} with {quantity} {_shown(stored)} of surface {k}, not {_shown(current)}"
     return f"{names[0]!r} with other numbers of its surfaces"
 
 
 def unlike(before: Mapping, now: Mapping) -> str:
-    """How what stored numbers depend on differs from what it is now, "" where it does not.
+    """How the conditions of stored numbers differ from the current ones, "" where they do not.
 
-    Both: `identity` of a lens, the names of its variables, and whatever else decides the numbers, by name.
+    Both: `identity` of a lens, the names of its variables, and all else that decides the numbers, by name.
     """
     try:
         if "prescription" in now and "prescription" not in before:
@@ -108,13 +105,13 @@ def unlike(before: Mapping, now: Mapping) -> str:
     return f"other {', '.join(other)}" if other else ""
 
 
-def alike(one: object, other: object) -> bool:
+def alike(a: object, b: object) -> bool:
     """Whether plain values are equal, numbers to the precision of float32."""
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(alike, one, other))
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=1e-6)
-    return one == other
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(alike, a, b))
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=1e-6)
+    return a == b
 
 
 def _shown(value: object) -> str:

@@ -9,7 +9,7 @@ of the surface's vertex.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ from raytrace.system.surface import Surface, freeform_sag, is_freeform, is_searc
 
 
 def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays cross the surface in their own direction of propagation; the path to it may be negative.
+    """The points where rays cross the surface in their direction of propagation; the path to it may be negative.
 
     position: (3, ...) mm, anywhere on the ray, in the frame of this surface's vertex; direction: (3, ...) unit.
     Returns the hit point (3, ...) mm and whether there is one (...). Of two crossings it is the one on the vertex
@@ -32,6 +32,12 @@ def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Te
     meeting = meet(surface, position.unbind(0), direction.unbind(0))
     hit = torch.stack(torch.broadcast_tensors(*meeting.hit, meeting.met)[:3])
     return torch.where(meeting.met, hit, 0.0), meeting.met
+
+
+#: A point or a direction: x, y, z (...).
+Vector: TypeAlias = Sequence[Tensor]
+#: A normal, not normalised, and its squared length.
+Normal: TypeAlias = tuple[tuple[Tensor, Tensor, Tensor], Tensor | float]
 
 
 class Meeting(NamedTuple):
@@ -47,8 +53,8 @@ class Meeting(NamedTuple):
     hit: tuple[Tensor, Tensor, Tensor]
     cosine: Tensor
     met: Tensor
-    normal: tuple | None = None
-    exact: tuple[Sequence[Tensor], Sequence[Tensor]] | None = None
+    normal: Normal | None = None
+    exact: tuple[Vector, Vector] | None = None
 
 
 def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
@@ -56,14 +62,14 @@ def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tenso
     if surface.phase is not None and kind_of(surface.phase).flat:
         meeting = _meet_plane(position, direction)
         return meeting._replace(met=meeting.met & _has_facet(surface, *meeting.hit[:2]))
-    if surface.is_plane:
-        return _meet_plane(position, direction)
     if is_searched(surface):
         return _meet_searched(surface, position, direction)
-    return _meet_conic(surface, position, direction)
+    if surface.curvature is None:
+        return _meet_plane(position, direction)
+    return _meet_conic(surface.curvature, surface.conic, position, direction)
 
 
-def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | float]:
+def normal(surface: Surface, hit: Sequence[Tensor]) -> Normal:
     """A normal at a point on the surface by components, not normalised, z > 0 at the vertex; its squared length.
 
     Conic: (-c x, -c y, 1 - (1+k) c z), squared length 1 - k c² r² on the surface (1 for a sphere): no square root.
@@ -72,29 +78,28 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     if surface.phase is not None and kind_of(surface.phase).flat:
         within = _has_facet(surface, x, y)
         return _sloped_normal(surface, torch.where(within, x, 0.0), torch.where(within, y, 0.0), None)
-    if surface.is_plane:
-        return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
     if is_searched(surface):
         return _sloped_normal(surface, x, y, None if surface.sag_terms is None else relief(surface.sag_terms))
-    c = surface.curvature
-    if surface.conic is None:
+    c, k = surface.curvature, surface.conic
+    if c is None:
+        return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
+    if k is None:
         return (-c * x, -c * y, 1 - c * z), 1.0
     # In this order no product of a backward derivative leaves the range of numbers: c² c̄ and r² c̄ would.
-    k = surface.conic
     return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
 
 
 def _has_facet(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-    """Whether points lie within the edge of the conic that facets have the slopes of."""
+    """Whether points lie within the edge of the conic whose slopes the facets have."""
     c = x.new_zeros(()) if surface.curvature is None else surface.curvature
     shape = 1.0 if surface.conic is None else 1 + surface.conic
     return (shape * c * c * (x * x + y * y)).detach() < 1
 
 
-def _meet_plane(position, direction) -> Meeting:
+def _meet_plane(position: Vector, direction: Vector) -> Meeting:
     x, y, z = position
     L, M, N = direction
-    # A ray along the plane misses it, and so does one that meets it further away than numbers go.
+    # A ray along the plane misses it, and so does a ray whose path to it leaves the range of numbers.
     reach = z.detach() / N.detach()
     met = reach * reach < float("inf")
     N = torch.where(met, N, 1.0)
@@ -104,16 +109,15 @@ def _meet_plane(position, direction) -> Meeting:
     return Meeting(hit, N, met, exact=exact)
 
 
-def _meet_conic(surface: Surface, position, direction) -> Meeting:
+def _meet_conic(c: Tensor, conic: Tensor | None, position: Vector, direction: Vector) -> Meeting:
     """F(t) = c/2 (x² + y² + (1+k) z²) - z = 0 along the ray: F' and F'' are as simple as F, and F' = -n·d.
 
     In float32 the root comes from float64 and a step would only add rounding: there only its derivatives are kept.
     """
-    c = surface.curvature
-    shape = None if surface.conic is None else 1 + surface.conic
+    shape = None if conic is None else 1 + conic
     foot, slide = foot_of(position, direction)
     way = way_of(position, direction, foot, slide)
-    root, met = conic_root(way.foot, way.direction, double(c), double(shape))
+    root, met = conic_root(way.foot, way.direction, double(c), None if shape is None else double(shape))
     t, exact = way.back(root, met)
     L, M, N = direction
     N = torch.where(met, N, 1.0)
@@ -127,11 +131,20 @@ def _meet_conic(surface: Surface, position, direction) -> Meeting:
     F = (0.5 * c) * torch.addcmul(x * x + y * y, shaped, z) - z
     d2F = c if shape is None else c * torch.addcmul(L * L + M * M, shape * N, N)
     step = _step(F, dF, d2F, polish)
-    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
-    return Meeting(hit, d2F * step - dF, met, exact=exact)
+    return Meeting(_moved(x, y, z, step, (L, M, N)), d2F * step - dF, met, exact=exact)
 
 
-def _meet_searched(surface: Surface, position, direction) -> Meeting:
+def _moved(x: Tensor, y: Tensor, z: Tensor, step: Tensor, direction: Vector) -> tuple[Tensor, Tensor, Tensor]:
+    """A point moved back by a step along its ray."""
+    L, M, N = direction
+    return (
+        torch.addcmul(x, step, L, value=-1),
+        torch.addcmul(y, step, M, value=-1),
+        torch.addcmul(z, step, N, value=-1),
+    )
+
+
+def _meet_searched(surface: Surface, position: Vector, direction: Vector) -> Meeting:
     """F(t) = z - S(x² + y²) - D(x, y) = 0 along the ray; the root itself is found outside the graph."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     bumps = None if surface.sag_terms is None else relief(surface.sag_terms)
@@ -149,7 +162,7 @@ def _meet_searched(surface: Surface, position, direction) -> Meeting:
         relief=bumps,
     )
     t, exact = way.back(root, met)
-    L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
+    L, M, N = (torch.where(met, d, axis) for d, axis in zip(direction, (0.0, 0.0, 1.0), strict=True))
     x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
     if is_freeform(surface):
         F, dF, d2F = _less((z, N, torch.zeros_like(N)), freeform_sag(surface, x, y, 2), L, M)
@@ -160,8 +173,8 @@ def _meet_searched(surface: Surface, position, direction) -> Meeting:
     if bumps is not None:
         F, dF, d2F = _less((F, dF, d2F), bumps.sag(x, y), L, M)
     step = _step(F, dF, d2F, t.dtype == torch.float64)
-    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
-    n, norm_squared = _sloped_normal(surface, *hit[:2], bumps)
+    hit = _moved(x, y, z, step, (L, M, N))
+    n, norm_squared = _sloped_normal(surface, hit[0], hit[1], bumps)
     return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared), exact)
 
 
@@ -171,7 +184,7 @@ def _less(F: Sequence[Tensor], D: Sag, L: Tensor, M: Tensor) -> tuple[Tensor, Te
     return F[0] - D.z, F[1] - (D.x * L + D.y * M), F[2] - turn
 
 
-def _sloped_normal(surface: Surface, x: Tensor, y: Tensor, bumps: Relief | None):
+def _sloped_normal(surface: Surface, x: Tensor, y: Tensor, bumps: Relief | None) -> Normal:
     """`normal` by the slopes of the sag: (-z_x, -z_y, 1)."""
     if is_freeform(surface):
         base = freeform_sag(surface, x, y, 1)
@@ -200,10 +213,10 @@ def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
     return step + (F / dF).detach() if polish else step
 
 
-def foot_of(position, direction) -> tuple[list[Tensor], Tensor]:
+def foot_of(position: Vector, direction: Vector) -> tuple[list[Tensor], Tensor]:
     """Foot of the perpendicular from the vertex to the ray, and the path to it.
 
-    From there a far origin costs no digits (Feder 1951, Spencer & Murty 1962); the slide stays in the graph.
+    From there a far origin loses no precision (Feder 1951, Spencer & Murty 1962); the slide stays in the graph.
     """
     slide = -dot(position, direction)
     return [torch.addcmul(p, slide, d) for p, d in zip(position, direction, strict=True)], slide
@@ -212,15 +225,15 @@ def foot_of(position, direction) -> tuple[list[Tensor], Tensor]:
 class Way(NamedTuple):
     """The ray on which a root is sought, detached and in float64.
 
-    foot, direction: triples; lag: of float32 rays the exact slide less theirs, else None; dtype: theirs.
+    foot, direction: triples; lag: of float32 rays the exact slide less theirs, else None; dtype: of the rays.
     """
 
-    foot: Sequence[Tensor]
-    direction: Sequence[Tensor]
+    foot: Vector
+    direction: Vector
     lag: Tensor | None
     dtype: torch.dtype
 
-    def back(self, root: Tensor, met: Tensor) -> tuple[Tensor, tuple | None]:
+    def back(self, root: Tensor, met: Tensor) -> tuple[Tensor, tuple[Vector, Vector] | None]:
         """The path from the foot of the rays, in their dtype; and `Meeting.exact`."""
         if self.lag is None:
             return root, None
@@ -228,7 +241,7 @@ class Way(NamedTuple):
         return torch.where(met, root + self.lag, 0.0).to(self.dtype), (hit, self.direction)
 
 
-def way_of(position, direction, foot, slide) -> Way:
+def way_of(position: Vector, direction: Vector, foot: Vector, slide: Tensor) -> Way:
     if slide.dtype == torch.float64:
         return Way([p.detach() for p in foot], [d.detach() for d in direction], None, slide.dtype)
     position, direction = doubles(position), doubles(direction)
@@ -240,12 +253,12 @@ def doubles(vector: Sequence[Tensor]) -> list[Tensor]:
     return [double(component) for component in vector]
 
 
-def double(x: Tensor | None) -> Tensor | None:
-    """A number in float64, outside the graph; None stays None."""
-    return None if x is None else x.detach().double()
+def double(x: Tensor) -> Tensor:
+    """A number in float64, outside the graph."""
+    return x.detach().double()
 
 
-def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor, Tensor]:
+def conic_root(foot: Vector, direction: Vector, c: Tensor, shape: Tensor | None) -> tuple[Tensor, Tensor]:
     """Path t (...) from the foot of the perpendicular to the conic of shape 1+k, 0 if there is none; and whether met.
 
         A t² - 2 G t + F = 0,  A = c (L² + M² + (1+k) N²),  G = N - c k p_z N - c (p·d),
@@ -306,18 +319,37 @@ def first_crossing(
     (inf: the whole sag); a crossing outside the rim is taken only if there is none in it. In float64; not
     differentiated: pass detached tensors.
     """
-    numbers, sag_terms = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
+    numbers = [] if relief is None else [number.detach() for number in relief.numbers]
+    sag_terms = "" if relief is None else relief.kind
     find = torch.ops.raytrace.first_crossing
     return find(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim)
 
 
 @torch.library.register_fake("raytrace::first_crossing")
-def _(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
+def _(
+    foot: Tensor,
+    direction: Tensor,
+    curvature: Tensor,
+    conic: Tensor,
+    coefficients: Tensor,
+    kind: str,
+    numbers: Sequence[Tensor],
+    sag_terms: str,
+    rim: float,
+) -> tuple[Tensor, Tensor]:
     batch = _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms)
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 
-def _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms: str) -> torch.Size:
+def _batch(
+    foot: Tensor,
+    direction: Tensor,
+    curvature: Tensor,
+    conic: Tensor,
+    coefficients: Tensor,
+    numbers: Sequence[Tensor],
+    sag_terms: str,
+) -> torch.Size:
     """The shape that the arguments of the operator broadcast to."""
     varied = Relief(sag_terms, numbers).batch if sag_terms else ()
     rays = foot.shape[1:], direction.shape[1:]
@@ -325,14 +357,14 @@ def _batch(foot, direction, curvature, conic, coefficients, numbers, sag_terms: 
 
 
 @torch.library.register_vmap("raytrace::first_crossing")
-def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
+def _(info: Any, in_dims: Sequence[Any], *arguments: Any) -> tuple[tuple[Tensor, ...], tuple[int, int]]:
     """The mapped axis goes in front of the batch axes; sag terms that differ are searched one by one."""
-    tensors, find = (foot, direction, curvature, conic, coefficients), torch.ops.raytrace.first_crossing
-    dims = in_dims[6] if sag_terms else []
+    *tensors, kind, numbers, sag_terms, rim = arguments
+    find, dims = torch.ops.raytrace.first_crossing, in_dims[6] if sag_terms else []
     if all(dim is None for dim in dims):
         return find(*_aligned(tensors, in_dims[:5]), kind, numbers, sag_terms, rim), (0, 0)
 
-    def part(inputs, dims, i: int) -> list[Tensor]:
+    def part(inputs: Sequence[Tensor], dims: Sequence[int | None], i: int) -> list[Tensor]:
         return [x if dim is None else x.select(dim, i) for x, dim in zip(inputs, dims, strict=True)]
 
     each = [
@@ -380,14 +412,14 @@ torch.library.impl("raytrace::first_crossing", "CompositeExplicitAutograd")(sear
 def _searched(rays: "_Rays", t: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
     """t and good, of rays that are not good by the bracketed search."""
     if not _reads_are_free(t):
-        t_few, found = _bracketed(rays)
-        return torch.where(found & ~good, t_few, t), good | found
+        t_few, is_crossing = _bracketed(rays)
+        return torch.where(is_crossing & ~good, t_few, t), good | is_crossing
     if bool(good.all()):
         return t, good
     few = ~good
-    t_few, found = _bracketed(rays.of(few))
+    t_few, is_crossing = _bracketed(rays.of(few))
     t, good = t.clone(), good.clone()
-    t[few], good[few] = torch.where(found, t_few, t[few]), found
+    t[few], good[few] = torch.where(is_crossing, t_few, t[few]), is_crossing
     return t, good
 
 
@@ -470,7 +502,7 @@ def _start(rays: _Rays) -> Tensor:
     return torch.where(usable & (radius <= rim), t, plane)
 
 
-def _residual(rays: _Rays, t: Tensor):
+def _residual(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """F = z - S, F' = dF/dt, the rounding scale of F, r² at t, and whether there is a surface."""
     p, d, c, k, a, _, kind, relief = rays
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
@@ -496,8 +528,11 @@ def _residual(rays: _Rays, t: Tensor):
     return F, dF, scale, u, inside_domain
 
 
-def _newton(rays: _Rays, t: Tensor):
-    """Newton's method with each ray frozen once converged, so that no ray's result depends on its neighbours."""
+def _newton(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """t by Newton's method, whether it is on the surface, whether the ray crosses it forwards, and the radius there.
+
+    A ray that has converged is moved no further, so that no result depends on the other rays.
+    """
     rounding = torch.finfo(t.dtype).eps
     active = torch.ones_like(t, dtype=torch.bool)
     for _ in range(_NEWTON_STEPS):
@@ -514,34 +549,34 @@ def _newton(rays: _Rays, t: Tensor):
     return t, small, forward, torch.sqrt(u)
 
 
-def _bracketed(rays: _Rays):
+def _bracketed(rays: _Rays) -> tuple[Tensor, Tensor]:
     """First crossing in the direction of propagation within rim and sag range (1-D batch).
 
     A sign change counts only between points on the surface: beyond the domain F does not exist, so the bisection ends
     at a crossing or at the edge of the domain; the residual distinguishes them.
     """
-    first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
+    first, last, possible = _stretch_round(rays) if rays.form is None else _stretch_freeform(rays, rays.form)
     width = (last - first) / _SAMPLES
     before, behind = _sides(rays, first + torch.arange(_SAMPLES + 1, device=first.device)[:, None] * width)
     leaves = before[:-1] & ~before[1:]
     steps = (leaves | ~(before[:-1] | behind[:-1]) & behind[1:]) & possible  # that may contain a crossing
     number = steps.cumsum(0)  # of a step, from 1, among those of its ray
     if _reads_are_free(first):
-        at, ray = (steps & (number <= _CANDIDATES)).nonzero(as_tuple=True)
-        if not len(at):
+        step, ray = (steps & (number <= _CANDIDATES)).nonzero(as_tuple=True)
+        if not len(step):
             return first, torch.zeros_like(possible)
         exists = torch.ones_like(ray, dtype=torch.bool)
     else:
         each = torch.stack([steps & (number == i) for i in range(1, _CANDIDATES + 1)])
-        at, exists = each.to(torch.uint8).argmax(1).flatten(), each.any(1).flatten()
+        step, exists = each.to(torch.uint8).argmax(1).flatten(), each.any(1).flatten()
         ray = torch.arange(len(first), device=first.device).repeat(_CANDIDATES)
-    right = first[ray] + (at + 1) * width[ray]
-    ends = ray, right - width[ray], right, leaves[at, ray]
+    right = first[ray] + (step + 1) * width[ray]
+    ends = ray, right - width[ray], right, leaves[step, ray]
     chunks = zip(*(end.split(max(_AT_ONCE, len(first))) for end in ends), strict=True)
-    found = [_bisected(rays.of(few), *ends_of_few) for few, *ends_of_few in chunks]
-    t, is_crossing = (torch.cat(parts) for parts in zip(*found, strict=True))
+    roots = [_bisected(rays.of(few), *ends_of_few) for few, *ends_of_few in chunks]
+    t, is_crossing = (torch.cat(parts) for parts in zip(*roots, strict=True))
     none = _CANDIDATES + 1
-    number = torch.where(is_crossing & exists, number[at, ray], none)
+    number = torch.where(is_crossing & exists, number[step, ray], none)
     least = torch.full_like(first, none, dtype=number.dtype).scatter_reduce(0, ray, number, "amin")
     is_first = (number < none) & (number == least[ray])  # one of a ray
     t = torch.zeros_like(first).scatter_add(0, ray, torch.where(is_first, t, 0.0))
@@ -568,7 +603,8 @@ def _sides(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
     ray = torch.arange(count, device=t.device)
     chunks = t.split(max(1, _AT_ONCE // max(count, 1)))
     sides = [_side(rays.of(ray.repeat(len(chunk))), chunk.flatten()) for chunk in chunks]
-    return tuple(torch.cat(side).reshape(t.shape) for side in zip(*sides, strict=True))
+    before, behind = (torch.cat(side).reshape(t.shape) for side in zip(*sides, strict=True))
+    return before, behind
 
 
 def _side(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -583,7 +619,7 @@ def _is_small(F: Tensor, dF: Tensor, scale: Tensor, u: Tensor, inside: Tensor) -
     return (F.abs() <= _ACCEPTED_RESIDUAL * torch.finfo(F.dtype).eps * scale) & inside
 
 
-def _stretch_round(rays: _Rays):
+def _stretch_round(rays: _Rays) -> tuple[Tensor, Tensor, Tensor]:
     """First and last t of a possible crossing, and whether there can be one."""
     p, (L, M, _), c, k, a, rim, *_ = rays
     big = _big(p)
@@ -610,30 +646,30 @@ def _stretch_round(rays: _Rays):
     return _between(rays, heights, 0.05, radius, first, last, possible)
 
 
-def _stretch_freeform(rays: _Rays):
+def _stretch_freeform(rays: _Rays, form: Form) -> tuple[Tensor, Tensor, Tensor]:
     """The same inside the box about the sheet of the vertex."""
     p, d, c, k, a, rim, *_ = rays
     big = _big(p)
     limit = torch.full_like(p[0], rim) if rim < big else _reach(rays)
-    sides = rays.form.extent(c, k, a, torch.full_like(p[0], min(rim, big)))
-    sides = [torch.where(side < big, side, limit) for side in sides]
+    extent = form.extent(c, k, a, torch.full_like(p[0], min(rim, big)))
+    sides = [torch.where(side < big, side, limit) for side in extent]
     first, last = torch.full_like(limit, -big), torch.full_like(limit, big)
     possible = torch.ones_like(limit, dtype=torch.bool)
-    for at, slope, side in zip(p, d, sides, strict=False):
+    for foot, slope, side in zip(p, d, sides, strict=False):
         oblique = slope != 0
-        ends = [(sign * side - at) / torch.where(oblique, slope, 1.0) for sign in (-1, 1)]
+        ends = [(sign * side - foot) / torch.where(oblique, slope, 1.0) for sign in (-1, 1)]
         first = torch.where(oblique, torch.maximum(first, torch.minimum(*ends)), first)
         last = torch.where(oblique, torch.minimum(last, torch.maximum(*ends)), last)
-        possible = possible & (oblique | (at.abs() <= side))
+        possible = possible & (oblique | (foot.abs() <= side))
     fraction = torch.linspace(0, 1 - 1e-8, 9, dtype=p.dtype, device=p.device)
     x, y = (fraction[:, None, None] * sides[0]), fraction[None, :, None] * sides[1]
-    heights = rays.form.sag(c, k, a[:, None, None], x, y, 0).z.flatten(0, 1)
+    heights = form.sag(c, k, a[:, None, None], x, y, 0).z.flatten(0, 1)
     return _between(rays, heights, 0.25, torch.hypot(*sides), first, last, possible)
 
 
-def _big(of: Tensor) -> float:
+def _big(like: Tensor) -> float:
     """A length whose square is finite."""
-    return torch.finfo(of.dtype).max ** 0.48
+    return torch.finfo(like.dtype).max ** 0.48
 
 
 def _reach(rays: _Rays) -> Tensor:
@@ -641,7 +677,9 @@ def _reach(rays: _Rays) -> Tensor:
     return 4 * (torch.sqrt(rays.p[0] ** 2 + rays.p[1] ** 2) + rays.p[2].abs())
 
 
-def _between(rays: _Rays, heights: Tensor, share: float, radius: Tensor, first, last, possible):
+def _between(
+    rays: _Rays, heights: Tensor, share: float, radius: Tensor, first: Tensor, last: Tensor, possible: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The range of t between the heights (k, n) mm, widened by a share of their range."""
     margin = (heights.amax(0) - heights.amin(0)) * share + torch.finfo(heights.dtype).tiny
     margin = margin if rays.relief is None else margin + rays.relief.size(radius)

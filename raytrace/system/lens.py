@@ -6,7 +6,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from typing import ParamSpec, TypeVar
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ RAY_AIMING = {
     "real": "to points of the stop, whose radius is that of the real marginal ray",
 }
 
-#: What the number of a system aperture means.
+#: The unit and meaning of the number of a system aperture.
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
     "image_f_number": "EFL / entrance pupil diameter",
@@ -56,18 +56,19 @@ APERTURE_KINDS = {
 
 # -- results that several analyses of a lens share ---------------------------------------------------------------------
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 _results: ContextVar[dict | None] = ContextVar("results", default=None)
-_MOST = 256  # results, the oldest being dropped first
+_MOST = 256  # results; the oldest is dropped first
 _FEW = 64  # numbers of an argument that are compared
 
 
 @contextlib.contextmanager
 def computed_once() -> Iterator[None]:
-    """Within: indices, first-order data, base rays and stop radius of every lens are computed once.
+    """Within the block, indices, first-order data, base rays and stop radius of every lens are computed once.
 
-    Not those that may be differentiated. No number of a lens may be changed in place meanwhile. Every public function
-    of a lens runs within, one that another calls within the same.
+    Results that may be differentiated are computed anew. No number of a lens may be changed in place within the block.
+    Every public function of a lens runs within such a block, which functions that it calls share.
     """
     if _results.get() is not None:
         yield
@@ -80,32 +81,32 @@ def computed_once() -> Iterator[None]:
 
 
 def shared(compute: Callable[P, T]) -> Callable[P, T]:
-    """A function of a lens, and of wavelengths, whose result the analyses within `computed_once` share."""
+    """A function of a lens, and of wavelengths, whose result is shared within `computed_once`."""
 
     @functools.wraps(compute)
     def result(*arguments: P.args, **options: P.kwargs) -> T:
         # torch.compile does not trace context variables; results within a transform belong to it.
         if torch.compiler.is_compiling() or options or (results := _results.get()) is None or in_transform():
             return compute(*arguments, **options)
-        if any(_is_its_own(argument, results) for argument in arguments):
-            return compute(*arguments)
+        if any(_is_not_shared(argument, results) for argument in arguments):
+            return compute(*arguments, **options)
         key = compute, *map(_key, arguments)
         if key not in results:
-            _store(results, key, compute(*arguments), arguments)
+            _store(results, key, compute(*arguments, **options), arguments)
         return results[key][0]
 
     return result
 
 
 def _store(results: dict, key: object, result: object, arguments: object) -> None:
-    """Stores a result with its arguments: as long as they live their identity is their own."""
+    """Stores a result with its arguments: an object that lives shares its identity with no other."""
     if len(results) >= _MOST:
         del results[next(iter(results))]
     results[key] = result, arguments
 
 
-def _is_its_own(argument: object, results: dict) -> bool:
-    """Whether a result of an argument is not shared: many wavelengths, or a number that may be differentiated."""
+def _is_not_shared(argument: object, results: dict) -> bool:
+    """Whether results of an argument are not shared: many wavelengths, or a number that may be differentiated."""
     if isinstance(argument, Tensor):
         return argument.numel() > _FEW or varies(argument)
     if id(argument) not in results:
@@ -114,18 +115,18 @@ def _is_its_own(argument: object, results: dict) -> bool:
 
 
 def _key(argument: object) -> object:
-    """A lens by its identity, wavelengths by their values, which are not read off another device."""
+    """A lens by its identity, wavelengths by their values, or by their identity on another device."""
     if isinstance(argument, Tensor) and argument.device.type == "cpu":
         return argument.dtype, *argument.shape, *argument.flatten().tolist()
     return id(argument)
 
 
 # -- batches of lenses -------------------------------------------------------------------------------------------------
-# Behind the axes that a number has by itself (the terms of an asphere, say) the axis of the lenses follows. `aligned`
+# The axis of the lenses follows the axes that a number has in one lens, as the terms of an asphere. `aligned`
 # puts axes of 1 behind it, against which fields, wavelengths and pupil points broadcast: rays (3, L, F, W, P).
 
-#: The values whose numbers may differ between lenses, and the axes that some of these have by themselves.
-_OWN_AXES = {
+#: The values whose numbers may differ between lenses, and the axes that some of these have in one lens.
+_OWN_AXES: dict[str, dict[str, int]] = {
     **{name: {"coefficients": 1} for name in ("Surface", "Glass", "ZernikeSag", "FringeSag", "PolynomialSag")},
     **{name: {"coefficients": 1} for name in ("PowerSag", "RadialPhase", "PolynomialPhase", "FringePhase")},
     **{name: {"coefficients": 1} for name in ("PolynomialPath", "RadialPath")},
@@ -142,39 +143,40 @@ _PARTS = ("surfaces", "aperture", "environment")
 
 
 def lens_count(lens: "Lens") -> int | None:
-    """L, how many lenses the numbers of a lens describe; None for a single lens.
+    """L, the number of lenses that a batch describes; None for a single lens.
 
     Raises ValueError for numbers of different counts.
     """
     counts: dict[int, str] = {}
-    for number, own, name, surface in _numbers(lens):
-        if number.dim() > own and number.shape[own] not in counts:
-            counts[number.shape[own]] = f"{name}" if surface is None else f"surface {surface}: {name.replace('_', ' ')}"
+    for number, axes, name, surface in _numbers(lens):
+        if number.dim() > axes and number.shape[axes] not in counts:
+            counts[number.shape[axes]] = name if surface is None else f"surface {surface}: {name.replace('_', ' ')}"
     several = [count for count in counts if count != 1]
     if len(several) > 1:
-        one, other, *_ = several
-        here, there = counts[one], counts[other]
-        raise ValueError(f"{here} has numbers of {one} lenses, {there} of {other}; expected as many, or one")
+        first, second, *_ = several
+        raise ValueError(
+            f"{counts[first]} has numbers of {first} lenses, {counts[second]} of {second}; expected as many, or one"
+        )
     return next(iter(several or counts), None)
 
 
 def batch_shape(lens: "Lens") -> torch.Size:
     """The shape (L, 1, …) that the numbers of an `aligned` batch broadcast to; () of a single lens."""
-    return broadcast_shape(*{number.shape[own:] for number, own, *_ in _numbers(lens)})
+    return broadcast_shape(*{number.shape[axes:] for number, axes, *_ in _numbers(lens)})
 
 
 @shared
 def aligned(lens: "Lens", axes: int, *, exactly: bool = False) -> "Lens":
-    """The lens with numbers (…, L) of a batch as (…, L, 1, …), at least, or exactly, so many axes of 1 behind.
+    """The lens with numbers (…, L) of a batch as (…, L, 1, …), with at least, or exactly, `axes` axes of 1 behind.
 
     A number that is common to all lenses, or has the axes, stays the same tensor.
     """
 
-    def align(number: Tensor, own: int) -> Tensor:
-        missing = own + 1 + axes - number.dim()
-        if number.dim() <= own or missing == 0 or (missing < 0 and not exactly):
+    def align(number: Tensor, inner: int) -> Tensor:
+        missing = inner + 1 + axes - number.dim()
+        if number.dim() <= inner or missing == 0 or (missing < 0 and not exactly):
             return number
-        return number.reshape(*number.shape[: own + 1], *(1,) * axes)
+        return number.reshape(*number.shape[: inner + 1], *(1,) * axes)
 
     return _mapped(lens, align)
 
@@ -195,13 +197,10 @@ def one_lens(lens: "Lens", number: int | slice | Tensor) -> "Lens":
     if isinstance(number, int) and not -count <= number < count:
         raise IndexError(f"lens {number} of a batch of {count} lenses; expected 0 to {count - 1}")
 
-    def take(entries: Tensor, own: int) -> Tensor:
-        if entries.dim() <= own:
+    def take(entries: Tensor, axes: int) -> Tensor:
+        if entries.dim() <= axes or (entries.shape[axes] == 1 and not isinstance(number, int)):
             return entries
-        chosen = (slice(None),) * own
-        if entries.shape[own] == 1:
-            return entries[(*chosen, 0)] if isinstance(number, int) else entries
-        return entries[(*chosen, number)]
+        return entries[(*(slice(None),) * axes, 0 if entries.shape[axes] == 1 else number)]
 
     return _mapped(lens, take)
 
@@ -209,46 +208,50 @@ def one_lens(lens: "Lens", number: int | slice | Tensor) -> "Lens":
 def batch(lenses: Sequence["Lens"]) -> "Lens":
     """One batch of several lenses that differ in their numbers alone.
 
-    What is equal in all of them stays single. Raises ValueError for none, and for lenses of different structure: other
-    surfaces, glass formulas, apertures.
+    A number that is equal in all of them stays single. Raises ValueError for no lenses, and for lenses of different
+    structure: other surfaces, glass formulas, apertures.
     """
     if not lenses:
         raise ValueError("a batch of no lenses; expected one or more")
     if any(lens_count(lens) is not None for lens in lenses):
         raise ValueError("a lens of the batch is a batch itself; expected single lenses")
     parts = [{name: part for name in _PARTS if (part := getattr(lens, name)) is not None} for lens in lenses]
-    flat = [pytree.tree_flatten(found) for found in parts]
+    flat = [pytree.tree_flatten(held) for held in parts]
     leaves, structures = zip(*flat, strict=True)
     for k, (numbers, structure) in enumerate(zip(leaves, structures, strict=True)):
         if structure != structures[0] or [n.shape for n in numbers] != [n.shape for n in leaves[0]]:
             raise ValueError(f"lens {k} has other surfaces, glasses or apertures than lens 0; expected other numbers")
     rows = {id(column[0]): column for column in zip(*leaves, strict=True)}
 
-    def join(number: Tensor, own: int) -> Tensor:
+    def join(number: Tensor, axes: int) -> Tensor:
         column = rows[id(number)]
         if all(entry is number or (not entry.requires_grad and torch.equal(entry, number)) for entry in column):
             return number
-        return torch.stack(column, own)
+        return torch.stack(column, axes)
 
     return _mapped(lenses[0], join)
 
 
 @functools.cache
 def _fields_of(kind: type) -> tuple[tuple[str, int], ...]:
-    """The fields of a value that hold numbers of a batch, and the axes that these have by themselves."""
-    own = _OWN_AXES.get(kind.__name__)
-    fields = () if own is None else dataclasses.fields(kind)
-    return tuple((field.name, own.get(field.name, 0)) for field in fields if holds_numbers(field.type))
+    """The fields of a value that hold numbers of a batch, and the axes that these have in one lens."""
+    axes = _OWN_AXES.get(kind.__name__)
+    if axes is None:
+        return ()
+    return tuple(
+        (field.name, axes.get(field.name, 0)) for field in dataclasses.fields(kind) if holds_numbers(field.type)
+    )
 
 
 def _numbers(lens: "Lens") -> Iterator[tuple[Tensor, int, str, int | None]]:
-    """Every number that may differ between lenses: its own axes, its name and its surface, None of the whole lens."""
+    """Every number that may differ between lenses: its axes in one lens, name, and surface, None of the whole lens."""
 
-    def walk(part, surface: int | None):
-        for name, own in _fields_of(type(part)):
+    def walk(part: object, surface: int | None) -> Iterator[tuple[Tensor, int, str, int | None]]:
+        kind: type = type(part)
+        for name, axes in _fields_of(kind):
             entry = getattr(part, name)
             if isinstance(entry, Tensor):
-                yield entry, own, name, surface
+                yield entry, axes, name, surface
             elif entry is not None:
                 yield from walk(entry, surface)
 
@@ -259,20 +262,21 @@ def _numbers(lens: "Lens") -> Iterator[tuple[Tensor, int, str, int | None]]:
 
 
 def _mapped(lens: "Lens", change: Callable[[Tensor, int], Tensor]) -> "Lens":
-    """The lens with changed numbers; change: number, how many axes it has by itself -> number.
+    """The lens with changed numbers; change: number, its axes in one lens -> number.
 
     A number that occurs in several places (the coefficients of air, say) stays one.
     """
     made: dict[int, Tensor] = {}
 
-    def walk(part):
-        changes = {}
-        for name, own in _fields_of(type(part)):
+    def walk(part: Any) -> Any:
+        kind: type = type(part)
+        changes: dict[str, Any] = {}
+        for name, axes in _fields_of(kind):
             before = getattr(part, name)
             if isinstance(before, Tensor):
                 if id(before) not in made:
-                    made[id(before)] = change(before, own)
-                after = made[id(before)]
+                    made[id(before)] = change(before, axes)
+                after: Any = made[id(before)]
             else:
                 after = before if before is None else walk(before)
             if after is not before:
@@ -377,19 +381,26 @@ class Lens:
     optimization_data: OptimizationData | None = None
     afocal: bool = False
 
-    count = property(lens_count)
     __getitem__ = one_lens
-
     with_configurations = multiple.made
     configuration = multiple.chosen
-    configurations = property(multiple.every)
+
+    @property
+    def count(self) -> int | None:
+        """L, the number of lenses of a batch; None for a single lens."""
+        return lens_count(self)
+
+    @property
+    def configurations(self) -> tuple["Lens", ...]:
+        """The lens in all its configurations; itself if it has one."""
+        return multiple.every(self)
 
     @property
     def primary(self) -> Tensor:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
 
     def __repr__(self) -> str:
@@ -426,20 +437,19 @@ class Lens:
         pressure: Tensor | float | None = None,
         configuration: int | None = None,
     ) -> "Lens":
-        """The same lens under other conditions; what is None stays.
+        """The same lens under other conditions; a condition that is None stays.
 
         object_distance: mm from the object to surface 1, inf allowed; sensor_distance: mm from the last surface before
         the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
         weight and the first one primary unless wavelength_weights (W,) and primary_wavelength, its number from 1, are
         given; fields: y, or (x, y), in the lens's own kind, without vignetting factors, alike in weight unless
         field_weights (F,) are given; weights: relative;
-        temperature: °C, pressure: atm, 0 in vacuum: what is not given of the two stays, or is 20 °C and 1 atm. Warns
+        temperature: °C, pressure: atm, 0 in vacuum; where one of the two is None, it stays, or is 20 °C or 1 atm. Warns
         NoThermalCoefficients. configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
         Raises ValueError for conditions that no lens has.
         """
-        found = self if configuration is None else self.configuration(configuration)
-        found = multiple.freed(
-            found,
+        lens = multiple.freed(
+            self if configuration is None else self.configuration(configuration),
             **dict(object_distance=object_distance, sensor_distance=sensor_distance, f_number=f_number),
             **dict(entrance_pupil_diameter=entrance_pupil_diameter, wavelengths=wavelengths),
             **dict(wavelength_weights=wavelength_weights, primary_wavelength=primary_wavelength),
@@ -447,43 +457,43 @@ class Lens:
             **dict(ray_aiming=ray_aiming, temperature=temperature, pressure=pressure),
         )
         if object_distance is not None:
-            found = with_object_distance(found, object_distance)
+            lens = with_object_distance(lens, object_distance)
         if sensor_distance is not None:
-            found = with_sensor_distance(found, sensor_distance)
+            lens = with_sensor_distance(lens, sensor_distance)
         if f_number is not None and entrance_pupil_diameter is not None:
             raise ValueError("f_number and entrance_pupil_diameter exclude each other: both are the size of the beam")
         for kind, number in (("image_f_number", f_number), ("entrance_pupil_diameter", entrance_pupil_diameter)):
             if number is not None:
-                found = dataclasses.replace(found, aperture=SystemAperture(kind, _like(number, self.aperture.value)))
+                lens = dataclasses.replace(lens, aperture=SystemAperture(kind, _like(number, self.aperture.value)))
         if wavelengths is not None:
-            found = with_wavelengths(found, wavelengths)
+            lens = with_wavelengths(lens, wavelengths)
         if fields is not None:
             x, y = field_points(fields, like=self.fields.y)
-            kept = dataclasses.replace(self.fields, x=x, y=y, weight=torch.ones_like(y), vignetting=None)
-            found = dataclasses.replace(found, fields=kept)
+            points = dataclasses.replace(self.fields, x=x, y=y, weight=torch.ones_like(y), vignetting=None)
+            lens = dataclasses.replace(lens, fields=points)
         if wavelength_weights is not None:
-            weights = _weights("wavelength", wavelength_weights, like=found.wavelengths)
-            found = dataclasses.replace(found, wavelength_weights=weights)
+            weights = _weights("wavelength", wavelength_weights, like=lens.wavelengths)
+            lens = dataclasses.replace(lens, wavelength_weights=weights)
         if primary_wavelength is not None:
-            found = dataclasses.replace(found, primary_wavelength=int(primary_wavelength))
+            lens = dataclasses.replace(lens, primary_wavelength=int(primary_wavelength))
         if field_weights is not None:
-            weights = _weights("field", field_weights, like=found.fields.y)
-            found = dataclasses.replace(found, fields=dataclasses.replace(found.fields, weight=weights))
+            weights = _weights("field", field_weights, like=lens.fields.y)
+            lens = dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, weight=weights))
         if ray_aiming is not None:
-            found = dataclasses.replace(found, ray_aiming=ray_aiming)
+            lens = dataclasses.replace(lens, ray_aiming=ray_aiming)
         if temperature is not None or pressure is not None:
-            found = with_environment(found, temperature, pressure)
-        check(found)
-        return found
+            lens = with_environment(lens, temperature, pressure)
+        check(lens)
+        return lens
 
-    def replace(self, surface: int, **numbers) -> "Lens":
+    def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
         surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
         x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
         A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. Raises
-        ValueError naming what the surface does not have, UnknownGlass.
+        ValueError for fields that a surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
@@ -492,9 +502,9 @@ class Lens:
         if "glass" in numbers:
             numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
         surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
-        found = dataclasses.replace(self, surfaces=tuple(surfaces))
-        _check_object(found)
-        return multiple.kept(found) if self.operands else found
+        lens = dataclasses.replace(self, surfaces=tuple(surfaces))
+        _check_object(lens)
+        return multiple.kept(lens) if self.operands else lens
 
 
 #: Fields of a surface and of its pose, by the name of a number of a pose: tilt_x; behind the surface, tilt_x_after.
@@ -508,7 +518,7 @@ _POSED = {
 torch.serialization.add_safe_globals([OptimizationData, Row, ScaledPath, Solve, Vary])
 
 
-def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
+def changed(surface: Surface, numbers: Mapping[str, Any], where: str, *, like: Tensor) -> Surface:
     """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature;
     tilt_x, … and tilt_x_after, …: of its poses, whose other numbers stay."""
     known = [field.name for field in dataclasses.fields(Surface)]
@@ -533,15 +543,17 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
         if bool((radius == 0).any()):
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
-    made = {name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()}
+    made: dict[str, Any] = {
+        name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()
+    }
     made |= {name: _with_tensors(v, like) for name, v in made.items() if name in ("phase", "before", "after")}
-    found = dataclasses.replace(surface, **made)
-    _check_kinds(found, where)
-    return found
+    result = dataclasses.replace(surface, **made)
+    _check_kinds(result, where)
+    return result
 
 
 def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tensor") -> Tensor:
-    """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) as it is; None: the lens's own.
+    """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) itself; None: the lens's.
 
     like: the lens whose kind of field it is, or a tensor of their dtype and device. Raises ValueError, also where the
     lens is in float16.
@@ -550,20 +562,20 @@ def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tens
         check_precision(like.wavelengths.dtype)
         if fields is None:
             return torch.stack([like.fields.x, like.fields.y])
-        found = field_points(fields, like=like.fields.y)
-        angles = [] if isinstance(fields, Tensor) or like.fields.kind != "angle" else found.T.flatten().tolist()
+        points = field_points(fields, like=like.fields.y)
+        angles = [] if isinstance(fields, Tensor) or like.fields.kind != "angle" else points.flatten().tolist()
         for angle in angles:
             if abs(angle) >= 90:
                 message = "a field angle is below 90 degrees, for rays start from the plane of the entrance pupil"
                 raise ValueError(f"{option('fields', f'{angle:g}')}: {message}")
-        return found
+        return points
     if isinstance(fields, Tensor):
         return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
-    listed = fields if isinstance(fields, Iterable) else [fields]
-    points = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in listed]
-    if not points or any(len(point) != 2 for point in points):
+    listed: Iterable[Any] = fields if isinstance(fields, Iterable) else [fields]
+    pairs = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in listed]
+    if not pairs or any(len(pair) != 2 for pair in pairs):
         raise ValueError(f"fields {fields!r}: expected numbers y, or pairs (x, y)")
-    return torch.tensor(points, dtype=like.dtype, device=like.device).T
+    return torch.tensor(pairs, dtype=like.dtype, device=like.device).T
 
 
 def vector(numbers: Tensor | Iterable[Tensor | float] | float, *, like: Lens) -> Tensor:
@@ -580,30 +592,32 @@ def wavelengths_of(lens: Lens, wavelengths: Tensor | Iterable[float] | float | N
     """The wavelengths (W,) µm: the lens's own, or those given; its media are checked at new ones, as `check_media`."""
     if wavelengths is None:
         return lens.wavelengths
-    found = vector(wavelengths, like=lens)
-    check_media(lens, found[~torch.isin(found, lens.wavelengths)])
-    return found
+    wavelengths = vector(wavelengths, like=lens)
+    check_media(lens, wavelengths[~torch.isin(wavelengths, lens.wavelengths)])
+    return wavelengths
 
 
-def _with_tensors(part, like: Tensor):
+def _with_tensors(part: Any, like: Tensor) -> Any:
     """A value whose plain numbers are tensors."""
     if part is None:
         return None
-    numeric = {field.name for field in dataclasses.fields(part) if field.type in (Tensor, Tensor | None)}
-    found = {name: getattr(part, name) for name in numeric}
-    return dataclasses.replace(part, **{name: _like(v, like) for name, v in found.items() if v is not None})
+    names = [field.name for field in dataclasses.fields(part) if field.type in (Tensor, Tensor | None)]
+    numbers = {name: number for name in names if (number := getattr(part, name)) is not None}
+    return dataclasses.replace(part, **{name: _like(number, like) for name, number in numbers.items()})
 
 
-def _weights(of: str, weights: Tensor | Sequence[float], *, like: Tensor) -> Tensor:
+def _weights(kind: str, weights: Tensor | Sequence[float], *, like: Tensor) -> Tensor:
     """Weights of the wavelengths or fields `like`, one for each. Raises ValueError."""
-    found = _like(weights, like)
-    if found.shape != like.shape:
-        raise ValueError(f"{option(f'{of}_weights')}: {found.numel()} found; expected {len(like)}, one for each {of}")
-    if not bool((torch.isfinite(found) & (found >= 0)).all() and (found > 0).any()):
+    shares = _like(weights, like)
+    if shares.shape != like.shape:
         raise ValueError(
-            f"{option(f'{of}_weights')} {found.tolist()}: expected numbers from 0 up, at least one above 0"
+            f"{option(f'{kind}_weights')}: {shares.numel()} found; expected {len(like)}, one for each {kind}"
         )
-    return found
+    if not bool((torch.isfinite(shares) & (shares >= 0)).all() and (shares > 0).any()):
+        raise ValueError(
+            f"{option(f'{kind}_weights')} {shares.tolist()}: expected numbers from 0 up, at least one above 0"
+        )
+    return shares
 
 
 def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:
@@ -615,18 +629,18 @@ def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:
         raise ValueError(f"{number!r} is not a number") from error
 
 
-def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
+def with_object_distance(lens: Lens, object_distance: Tensor | float) -> Lens:
     """The lens with its object at another distance, mm from surface 1; inf allowed."""
     return _with_thickness(lens, 0, object_distance)
 
 
-def with_sensor_distance(lens: Lens, sensor_distance: Tensor) -> Lens:
+def with_sensor_distance(lens: Lens, sensor_distance: Tensor | float) -> Lens:
     """The lens with its sensor at another distance, mm from the last surface before the image."""
     return _with_thickness(lens, len(lens.surfaces) - 2, sensor_distance)
 
 
 def with_wavelengths(
-    lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None, *, where: str = ""
+    lens: Lens, wavelengths: Tensor | Sequence[float] | float, weights: Tensor | None = None, *, where: str = ""
 ) -> Lens:
     """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default.
 
@@ -639,29 +653,29 @@ def with_wavelengths(
 
 
 def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: Tensor | float | None) -> Lens:
-    """The lens at another temperature in °C and pressure in atm; what is None stays, or is 20 °C and 1 atm.
+    """The lens at another temperature in °C and pressure in atm; where one is None, it stays, or is 20 °C or 1 atm.
 
-    A surface with an environment of its own keeps it. Raises ValueError for what no air has; warns
-    NoThermalCoefficients, once for each glass whose change is not known.
+    A surface with an environment of its own keeps it. Raises ValueError for a temperature or pressure that air cannot
+    have; warns NoThermalCoefficients, once for each glass whose change is not known.
     """
     before = lens.environment or _reference(lens.wavelengths)
     temperature = before.temperature if temperature is None else _like(temperature, lens.wavelengths)
     pressure = before.pressure if pressure is None else _like(pressure, lens.wavelengths)
-    found = dataclasses.replace(lens, environment=Environment(temperature, pressure))
-    _check_environments(found)
-    for number, message in unknown_changes(found).items():
+    lens = dataclasses.replace(lens, environment=Environment(temperature, pressure))
+    _check_environments(lens)
+    for number, message in unknown_changes(lens).items():
         warnings.warn(f"surface {number}: {message}", NoThermalCoefficients, stacklevel=calling_level())
-    return found
+    return lens
 
 
 def unknown_changes(lens: Lens) -> dict[int, str]:
-    """What is not known of the glasses of a lens in its environment, by the first surface of each, in words."""
-    found: dict[tuple[str, str], tuple[int, str]] = {}
+    """Messages about glasses whose change with the environment is not known, by the first surface of each."""
+    messages: dict[tuple[str, str], tuple[int, str]] = {}
     for number, surface in enumerate(lens.surfaces):
         place = surface.environment or lens.environment
         if place is not None and (message := unknown_change(surface.glass, place)):
-            found.setdefault((message, surface.glass.catalog), (number, message))
-    return dict(found.values())
+            messages.setdefault((message, surface.glass.catalog), (number, message))
+    return dict(messages.values())
 
 
 @shared
@@ -781,7 +795,7 @@ def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:
 
 
 def check(lens: Lens) -> None:
-    """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
+    """Raise ValueError for a lens that cannot be traced as a whole."""
     check_precision(lens.wavelengths.dtype)
     last = len(lens.surfaces) - 1
     if lens.ray_aiming not in RAY_AIMING:
@@ -823,21 +837,22 @@ def check(lens: Lens) -> None:
 
 
 def _check_environments(lens: Lens) -> None:
-    """Refuse a temperature or a pressure that no air has."""
-    for where, holder in (("", lens), *((f"surface {k}: ", surface) for k, surface in enumerate(lens.surfaces))):
-        if holder.environment is not None and (wrong := objection(holder.environment)):
+    """Refuse a temperature or a pressure that air cannot have."""
+    places = {"": lens.environment, **{f"surface {k}: ": part.environment for k, part in enumerate(lens.surfaces)}}
+    for where, environment in places.items():
+        if environment is not None and (wrong := objection(environment)):
             raise ValueError(where + wrong)
 
 
 def _check_kinds(surface: Surface, where: str) -> None:
-    """Refuse a kind of sag or a shape of aperture that there is not, and sizes that a shape does not have."""
+    """Refuse an unknown kind of sag or shape of aperture, and sizes that a shape does not have."""
     if surface.kind not in KINDS:
         raise ValueError(f"{where}: kind {surface.kind!r}; expected one of {', '.join(KINDS)}")
     kind, count = KINDS[surface.kind], 0 if surface.coefficients is None else len(surface.coefficients)
     if not kind.least <= count <= (kind.most or count):
-        named = ", ".join(kind.name_of(entry) for entry in range(kind.most or count))
+        names = ", ".join(kind.name_of(entry) for entry in range(kind.most or count))
         expected = kind.least if kind.most == kind.least else f"{kind.least} to {kind.most}"
-        raise ValueError(f"{where}: a {kind.name} of {count} coefficients; expected {expected}: {named}")
+        raise ValueError(f"{where}: a {kind.name} of {count} coefficients; expected {expected}: {names}")
     for aperture in surface.apertures:
         if aperture.shape not in SHAPES:
             known = ", ".join(SHAPES)

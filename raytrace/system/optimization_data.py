@@ -28,6 +28,10 @@ class Vary:
     operand: int | None = None
     bounds: tuple[float, ...] = ()
 
+    @property
+    def address(self) -> tuple[int, str]:
+        return self.surface, self.quantity
+
     def __str__(self) -> str:
         within = f" from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else ""
         return f"{_where(self)}{within}"
@@ -74,12 +78,21 @@ class Solve:
     configuration: int = 0
     operand: int | None = None
 
+    @property
+    def address(self) -> tuple[int, str]:
+        return self.surface, self.quantity
+
+    @property
+    def address_of_source(self) -> tuple[int, str]:
+        """Of the number that a pickup follows."""
+        return self.source, self.quantity_of_source or self.quantity
+
     def __str__(self) -> str:
         if self.kind == "pickup" and self.operand is None:
-            named = self.quantity_of_source or self.quantity
+            quantity = self.quantity_of_source or self.quantity
             scale = "" if self.scale == 1 else f"{self.scale:g} × "
             offset = "" if self.offset == 0 else f" {'-' if self.offset < 0 else '+'} {abs(self.offset):g}"
-            return f"{_where(self)} = {scale}{named} of surface {self.source}{offset}"
+            return f"{_where(self)} = {scale}{quantity} of surface {self.source}{offset}"
         numbers = " ".join(f"{number:g}" for number in self.numbers)
         return f"{_where(self)}: {self.kind} {numbers}".rstrip()
 
@@ -111,7 +124,7 @@ class Row:
     text: str = ""
     further: tuple[float, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, size, zero in (("integers", 2, 0), ("numbers", 4, 0.0)):
             given = getattr(self, name)
             if isinstance(given, tuple) and len(given) == size:
@@ -126,7 +139,9 @@ class Row:
         """Name of the operand, or of its function."""
         if isinstance(self.operand, str):
             return self.operand
-        return getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
+        return str(
+            getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +165,11 @@ class OptimizationData:
     semi_diameter_margin: tuple[float, float] = (0.0, 0.0)
     kept: tuple[Solve, ...] = ()
     distributions: tuple[tuple[str, tuple[tuple[float, float], ...]], ...] = ()
+
+    @property
+    def rules(self) -> tuple[Vary | Solve, ...]:
+        """Variables, solves and kept rules."""
+        return (*self.variables, *self.solves, *self.kept)
 
     def __str__(self) -> str:
         counts = Counter(row.name for row in self.merit)

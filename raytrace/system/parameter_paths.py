@@ -2,7 +2,7 @@
 
 thickness:5,6 curvature:1-4 a4:3 sensor     numbers of surfaces, which are counted as in the file
 sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
-2:15                                        least and greatest
+2:15                                        smallest and largest
 
 `parameter_paths` lists the numbers of a surface of any kind: of its shape, its phase and its poses.
 `with_numbers_of` is the lens with other numbers, by surface and name.
@@ -12,19 +12,21 @@ import dataclasses
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from raytrace.materials.glass import is_air
+from raytrace.maths.numerics import Value
+from raytrace.system.configurations import Path
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
 from raytrace.words import RaytraceError
 
-#: A number of a lens: of which surface, and which.
+#: A number of a lens: its surface and its name.
 Address = tuple[int, str]
 
 #: Numbers of the lens that no surface has: of the system aperture, and of the air (°C, atm).
@@ -48,18 +50,18 @@ _OF_SEVERAL = [field.name for field in _NUMERIC if field.name not in (*_SINGLE, 
 
 
 class ParameterPath(NamedTuple):
-    """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
+    """The path of a number in a surface: the fields down to it, and the entry of a tensor of several."""
 
     path: tuple[str, ...]
     entry: int | None = None
 
     @property
-    def steps(self) -> tuple:
+    def steps(self) -> Path:
         """The path as that of `configurations.part`."""
         return self.path if self.entry is None else (*self.path, (self.entry,))
 
 
-#: Where a lens holds the numbers that no surface has.
+#: The paths of the numbers of a lens that no surface has.
 OF_LENS = {
     APERTURE: ParameterPath(("aperture", "value")),
     TEMPERATURE: ParameterPath(("environment", "temperature")),
@@ -101,8 +103,8 @@ def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str,
     return {f"{name}{entry + 1}": ParameterPath(path, entry) for entry in range(part.numel())}
 
 
-def number_at(part, place: ParameterPath) -> Tensor | None:
-    """The number at a path; None where it is not modelled."""
+def number_at(part: Any, place: ParameterPath) -> Any:
+    """The number at a path, a tensor; None where it is not modelled."""
     for name in place.path:
         part = getattr(part, name)
     if place.entry is None:
@@ -110,7 +112,7 @@ def number_at(part, place: ParameterPath) -> Tensor | None:
     return part[place.entry] if part.dim() > _PLAIN else part.reshape(-1)[place.entry]
 
 
-def with_number(part, place: ParameterPath, number: Tensor):
+def with_number(part: Value, place: ParameterPath, number: Any) -> Value:
     """The surface with another number at a path."""
     name, *rest = place.path
     old = getattr(part, name)
@@ -123,7 +125,7 @@ def with_number(part, place: ParameterPath, number: Tensor):
     elif place.entry is not None:
         flat = old.reshape(-1)
         number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
-    return dataclasses.replace(part, **{name: number})
+    return cast(Value, dataclasses.replace(cast(Any, part), **{name: number}))
 
 
 class UnknownNumber(RaytraceError, ValueError):
@@ -131,7 +133,7 @@ class UnknownNumber(RaytraceError, ValueError):
 
 
 def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
-    """Where a surface holds a number. Raises UnknownNumber."""
+    """The path of a number in a surface, by its name. Raises UnknownNumber."""
     if quantity.startswith(GLASS_NUMBER):
         return ParameterPath(("glass", "coefficients"), int(quantity.removeprefix(GLASS_NUMBER)) - 1)
     known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
@@ -146,7 +148,7 @@ def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
 def with_numbers_of(
     lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
 ) -> Lens:
-    """The lens with other numbers, by address; known: their places, where they have been looked up before."""
+    """The lens with other numbers, by address; known: their paths, where these have been looked up before."""
     surfaces = list(lens.surfaces)
     for (surface, quantity), number in numbers.items():
         if (surface, quantity) in OF_LENS:
@@ -157,15 +159,15 @@ def with_numbers_of(
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
-def stored_number(lens: Lens, at: Address) -> Tensor | None:
+def stored_number(lens: Lens, address: Address) -> Tensor | None:
     """The number at an address; None where a surface does not model it. Raises UnknownNumber."""
-    if at in OF_LENS:
-        return number_at(lens, OF_LENS[at])
-    surface = lens.surfaces[at[0]]
-    return number_at(surface, path_of(surface, at[1], f"surface {at[0]}: "))
+    if address in OF_LENS:
+        return number_at(lens, OF_LENS[address])
+    surface = lens.surfaces[address[0]]
+    return number_at(surface, path_of(surface, address[1], f"surface {address[0]}: "))
 
 
-def names_at(surface: Surface, path: tuple) -> list[str]:
+def names_at(surface: Surface, path: Path) -> list[str]:
     """The names by which a surface's number at a path of `configurations` is known."""
     known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
     entry = path[-1] if isinstance(path[-1], tuple) else None
@@ -181,8 +183,9 @@ def modelled(surface: Surface, name: str) -> Surface:
     "_after", behind it.
     """
     zero = torch.zeros_like(surface.thickness)
+    changes: dict[str, Any] = {name: zero}
     if name in ("curvature", "conic"):
-        return surface if getattr(surface, name) is not None else dataclasses.replace(surface, **{name: zero})
+        return surface if getattr(surface, name) is not None else dataclasses.replace(surface, **changes)
     if name in parameter_paths(surface):
         return surface
     term = re.fullmatch(r"a(\d+)", name)
@@ -193,11 +196,13 @@ def modelled(surface: Surface, name: str) -> Surface:
     field, side = name.removesuffix("_after"), "after" if name.endswith("_after") else "before"
     pose = getattr(surface, side) or Pose()
     if field in _POSED and isinstance(pose, Pose):
-        return dataclasses.replace(surface, **{side: dataclasses.replace(pose, **{field: zero})})
+        changes = {field: zero}
+        changes = {side: dataclasses.replace(pose, **changes)}
+        return dataclasses.replace(surface, **changes)
     return surface
 
 
-#: Surfaces and configurations are counted up to this number, and so many are named at a time.
+#: Largest number of a surface or configuration, and of their count in a list.
 MOST = 10_000
 
 
@@ -214,16 +219,16 @@ def joined(words: str | Sequence[str]) -> str:
     return words if isinstance(words, str) else " ".join(words)
 
 
-def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
+def counted(word: str, numbers: str, noun: str = "surface") -> list[int]:
     """The numbers of a list like "1,3-5". Raises BadVariables with the word."""
     listed: list[int] = []
     for part in numbers.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
         if not match:
-            raise BadVariables(f"{word!r}: {part!r} is no {what} number; expected numbers and ranges like 1,3-5")
+            raise BadVariables(f"{word!r}: {part!r} is no {noun} number; expected numbers and ranges like 1,3-5")
         first, last = (int(digits) if len(digits) < 10 else MOST + 1 for digits in (match[1], match[2] or match[1]))
         if last > MOST or len(listed) + last - first > MOST:
-            raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {what} {MOST}, which no lens has")
+            raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {noun} {MOST}, which no lens has")
         listed += range(first, last + 1)
     return listed
 
@@ -239,8 +244,8 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
     for word in text.split():
         name, _, ends = word.rpartition(":")
         try:
-            low, high = ends.split(".." if ".." in ends else ",")
-            low, high = float(low or -math.inf), float(high or math.inf)
+            first, last = ends.split(".." if ".." in ends else ",")
+            low, high = float(first or -math.inf), float(last or math.inf)
         except ValueError as error:
             raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
         if not low < high:
@@ -250,7 +255,7 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
 
 
 def parse_range(text: str) -> tuple[float, float]:
-    """Least and greatest of "2:15", or of "2" (nothing at most). Raises BadLimits."""
+    """The smallest and largest number of "2:15", or of "2" (no upper limit). Raises BadLimits."""
     least, colon, most = text.partition(":")
     try:
         low, high = float(least), float(most) if colon else math.inf

@@ -1,15 +1,15 @@
-"""Phases: optical path that a thin structure adds on a surface, or its action in place of Snell's law; a row a kind.
+"""Phases: optical path that a thin structure adds on a surface, or its action in place of Snell's law.
 
-A grating, a hologram or a diffractive lens adds a path p(x, y), in mm, and its gradient to what light carries along
-the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`tracing.trace`). An ideal lens bends slopes instead, and the facets
-of a Fresnel lens stand on a plane. A new kind is a new value and a new row of PHASES: rays, derivatives, first order,
-variables and files read it.
+A grating, a hologram or a diffractive lens adds a path p(x, y), in mm, and its gradient to the tangential component of
+n d: [n2 d2] = [n1 d1] + ∇p (`tracing.trace`). An ideal lens changes slopes instead, and the facets of a Fresnel lens
+stand on a plane. A new kind is a new value and a new row of PHASES: rays, derivatives, first order, variables and files
+read it.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,9 @@ from raytrace.maths.bivariate import fringe_to_powers, polynomial_xy
 from raytrace.maths.numerics import dot, polynomial, value
 
 _MICROMETRE = 1e-3  # mm
+
+#: A point or a direction: x, y, z (...).
+Vector = Tensor | Sequence[Tensor]
 
 
 class Added(NamedTuple):
@@ -117,8 +120,8 @@ class IdealLens:
 
     power_x, power_y: 1/mm. vergence: 1/s, s mm from the point that is imaged sharply, in the direction of light, to the
     lens: light from there has the same path along every ray (of unequal powers only near the axis); None, or 0, for a
-    point at infinity. A lens that is traced as a whole finds it out itself: see `tracing.trace.sequence_of`.
-    opd_mode: how OpticStudio counts the path, 0 to 3; kept for the file.
+    point at infinity. It is computed where a whole lens is traced: see `tracing.trace.sequence_of`.
+    opd_mode: OpticStudio's mode of the path, 0 to 3; kept for the file.
     """
 
     power_x: Tensor
@@ -129,7 +132,7 @@ class IdealLens:
 
 @value
 class Facets:
-    """A Fresnel lens: rays meet the plane of the vertex, and are bent as by the curved surface above that point."""
+    """A Fresnel lens: rays meet the plane of the vertex, and refract as at the curved surface above that point."""
 
 
 Phase = Grating | RadialPhase | PolynomialPhase | FringePhase | Hologram | IdealLens | Facets | Path
@@ -141,12 +144,12 @@ class PhaseKind:
 
     path: phase, λ -> the path itself.
     power: phase, λ -> -∂²p/∂x² and -∂²p/∂y² at the vertex in 1/mm: its paraxial power.
-    slopes: whether it bends slopes by that power, in place of Snell's law; flat: whether rays meet the plane of the
-    vertex, whatever the shape of the surface is; is_round: about the axis; chromatic: whether λ makes a difference.
+    slopes: whether it changes slopes by that power, in place of Snell's law; flat: whether rays meet the plane of the
+    vertex, whatever the shape of the surface is; is_round: about the axis; chromatic: whether it depends on λ.
     """
 
-    path: Callable | None = None
-    power: Callable | None = None
+    path: Callable[[Any, Any], Path] | None = None
+    power: Callable[[Any, Any], tuple[Tensor, Tensor]] | None = None
     slopes: bool = False
     flat: bool = False
     is_round: bool = False
@@ -199,6 +202,10 @@ def _hologram_added(hologram: HologramPath, x: Tensor, y: Tensor) -> Added:
     return Added(scale * path, scale * slope_x, scale * slope_y)
 
 
+def _hologram(phase: Hologram, wavelength: Tensor) -> HologramPath:
+    return HologramPath(phase.first, phase.second, -phase.order * wavelength / phase.wavelength)
+
+
 def _hologram_power(phase: Hologram | HologramPath, wavelength: Tensor) -> tuple[Tensor, Tensor]:
     def power_along(axis: int) -> Tensor:
         total = torch.zeros_like(scale)
@@ -207,7 +214,7 @@ def _hologram_power(phase: Hologram | HologramPath, wavelength: Tensor) -> tuple
             total = total + (squared - point[axis] ** 2) / squared**1.5
         return -scale * total
 
-    scale = path_of(phase, wavelength).scale
+    scale = (phase if isinstance(phase, HologramPath) else _hologram(phase, wavelength)).scale
     return power_along(0), power_along(1)
 
 
@@ -217,10 +224,7 @@ PHASES = {
     "RadialPhase": PhaseKind(path=_radial, is_round=True),
     "PolynomialPhase": PhaseKind(path=_polynomial),
     "FringePhase": PhaseKind(path=_fringe),
-    "Hologram": PhaseKind(
-        path=lambda phase, wl: HologramPath(phase.first, phase.second, -phase.order * wl / phase.wavelength),
-        power=_hologram_power,
-    ),
+    "Hologram": PhaseKind(path=_hologram, power=_hologram_power),
     "IdealLens": PhaseKind(power=lambda lens, _: (lens.power_x, lens.power_y), slopes=True, chromatic=False),
     "Facets": PhaseKind(flat=True, is_round=True, chromatic=False),
     "PolynomialPath": PhaseKind(path=lambda path, _: path, chromatic=False),
@@ -234,11 +238,17 @@ def kind_of(phase: Phase) -> PhaseKind:
     return PHASES[type(phase).__name__]
 
 
-def path_of(phase: Phase, wavelength: Tensor | None) -> Path | None:
-    """The path that a phase adds; None for one that adds none. wavelength: (...) µm."""
+def _kind_at(phase: Phase, wavelength: Tensor | None) -> PhaseKind:
+    """The row of a phase. Raises ValueError for a chromatic phase without wavelengths."""
     kind = kind_of(phase)
     if kind.chromatic and wavelength is None:
-        raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
+        raise ValueError(f"the action of a phase ({type(phase).__name__}) depends on the wavelength: pass `wavelength`")
+    return kind
+
+
+def path_of(phase: Phase, wavelength: Tensor | None) -> Path | None:
+    """The path that a phase adds; None for a phase that adds none. wavelength: (...) µm."""
+    kind = _kind_at(phase, wavelength)
     return None if kind.path is None else kind.path(phase, wavelength)
 
 
@@ -252,25 +262,24 @@ def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) ->
         order = torch.arange(1, len(a) + 1, dtype=a.dtype, device=a.device).reshape(-1, *(1,) * (a.dim() - 1))
         twice = 2 * polynomial(order * a, u)
         return Added(u * polynomial(a, u), twice * x, twice * y)
+    if path is None:
+        raise TypeError(f"a phase ({type(phase).__name__}) adds no path")
     z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)
     return Added(z if path.constant is None else z + path.constant, slope_x, slope_y)
 
 
-def power_of(phase: Phase, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """The paraxial power (...) 1/mm in x and y, -∂²p/∂x² and -∂²p/∂y² at the vertex."""
-    kind = kind_of(phase)
+def power_of(phase: Phase, wavelength: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The paraxial power (...) 1/mm in x and y, -∂²p/∂x² and -∂²p/∂y² at the vertex. wavelength: (...) µm."""
+    kind = _kind_at(phase, wavelength)
     if kind.power is not None:
         return kind.power(phase, wavelength)
-    zero = torch.zeros_like(wavelength)
-    if kind.path is None:
-        return zero, zero
-    c = kind.path(phase, wavelength).coefficients
-    if kind.is_round:
-        return (-2 * c[0], -2 * c[0]) if len(c) else (zero, zero)
-    return tuple(-2 * c[k] if len(c) > k else zero for k in (2, 4))
+    path, zero = path_of(phase, wavelength), torch.zeros(()) if wavelength is None else torch.zeros_like(wavelength)
+    c = path.coefficients if isinstance(path, PolynomialPath | RadialPath) else ()
+    along_x, along_y = (0, 0) if kind.is_round else (2, 4)
+    return (-2 * c[along_x] if len(c) > along_x else zero), (-2 * c[along_y] if len(c) > along_y else zero)
 
 
-def ideal_path(lens: IdealLens, point, before, behind, n1: Tensor, n2: Tensor) -> Tensor:
+def ideal_path(lens: IdealLens, point: Vector, before: Vector, behind: Vector, n1: Tensor, n2: Tensor) -> Tensor:
     """The path (...) mm through an ideal lens that makes it alike along all rays of a point, O, to its image, I.
 
         Δ = n1 (|O| - |OP|) + n2 (|I| - |PI|) + (φx - φy) (x² - y²)/4,  n1/s + n2/s′ = (φx + φy)/2
@@ -287,8 +296,8 @@ def ideal_path(lens: IdealLens, point, before, behind, n1: Tensor, n2: Tensor) -
     return round_part + 0.25 * (lens.power_x - lens.power_y) * (x * x - y * y)
 
 
-def _longer(x: Tensor, y: Tensor, direction, vergence: Tensor, sign: float) -> Tensor:
-    """How much longer the way from the vertex to a point on the ray is than the ray's own."""
+def _longer(x: Tensor, y: Tensor, direction: Vector, vergence: Tensor, sign: float) -> Tensor:
+    """|O| - |OP| of `ideal_path` of a ray's direction, or of its image."""
     L, M, N = direction
     v = N.abs() * vergence
     along = sign * (L * x + M * y)

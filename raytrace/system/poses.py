@@ -4,11 +4,12 @@
     old = Rz Ry Rx (new + d)        tilts first, which undoes the other with every number negated
 
 d = (x, y, z), and R turn about the axes of x, y and z by right-handed angles: OpticStudio's coordinate break of order 0
-and 1. Numbers that are None are not modelled, and cost nothing.
+and 1. Numbers that are None are not modelled.
 """
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,7 +62,7 @@ Vector = Sequence[Tensor]
 def point_in(pose: Pose | Turn, point: Vector) -> Vector:
     """A point (x, y, z) of (...) mm each, in the new axes."""
     if isinstance(pose, Turn):
-        return [at + step for at, step in zip(direction_in(pose, point), pose.shift, strict=True)]
+        return [turned + step for turned, step in zip(direction_in(pose, point), pose.shift, strict=True)]
     if pose.tilts_first:
         return _moved(pose, direction_in(pose, point))
     return direction_in(pose, _moved(pose, point))
@@ -70,7 +71,8 @@ def point_in(pose: Pose | Turn, point: Vector) -> Vector:
 def direction_in(pose: Pose | Turn, direction: Vector) -> Vector:
     """A direction, by components (...), in the new axes."""
     if isinstance(pose, Turn):
-        return [sum(r * d for r, d in zip(row, direction, strict=True)) for row in pose.rotation]
+        x, y, z = direction
+        return [row[0] * x + row[1] * y + row[2] * z for row in pose.rotation]
     for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
         tilt = getattr(pose, name)
         if tilt is not None:
@@ -92,18 +94,19 @@ def direction_out(pose: Pose, direction: Vector) -> Vector:
 
 
 def undone(pose: Pose) -> Pose:
-    """The pose that leads back."""
-    numbers = (pose.x, pose.y, pose.z, pose.tilt_x, pose.tilt_y, pose.tilt_z)
-    return Pose(*(None if number is None else -number for number in numbers), tilts_first=not pose.tilts_first)
+    """The inverse pose."""
+    numbers = {name: number for name in ("x", "y", "z", *_TURNS) if (number := getattr(pose, name)) is not None}
+    negated: dict[str, Any] = {name: -number for name, number in numbers.items()}
+    return dataclasses.replace(pose, tilts_first=not pose.tilts_first, **negated)
 
 
 def _moved(pose: Pose, point: Vector) -> Vector:
     steps = (pose.x, pose.y, pose.z)
-    return [at if step is None else at - step for at, step in zip(point, steps, strict=True)]
+    return [old if step is None else old - step for old, step in zip(point, steps, strict=True)]
 
 
 def cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
-    """cos and sin (...) of an angle in degrees, exactly 0 and ±1 at whole right angles: a fold of 90° is one."""
+    """cos and sin (...) of an angle in degrees, exactly 0 and ±1 at multiples of 90°, such as the angle of a fold."""
     radians = torch.deg2rad(degrees)
     cosine, sine = torch.cos(radians), torch.sin(radians)
     quarter = torch.remainder(degrees.detach(), 180.0)
@@ -140,13 +143,13 @@ def rows_along(steps: Sequence[Pose | Tensor | None]) -> Rows:
 
 
 def rows_back(rows: Rows) -> Rows:
-    """The rows that lead back: new = rotationᵀ · (old - shift)."""
+    """The inverse rows: new = rotationᵀ · (old - shift)."""
     turned = [[rows[j][i] for j in range(3)] for i in range(3)]
     return [[*row, _negative(_dot(row, [entry[3] for entry in rows]))] for row in turned]
 
 
 def rows_of_both(first: Rows, second: Rows) -> Rows:
-    """The rows of one passage and then another."""
+    """The rows of two passages in sequence."""
     columns = list(zip(*first, strict=True))
     return [
         [_sum(_dot(row[:3], column), row[3] if j == 3 else 0.0) for j, column in enumerate(columns)] for row in second
@@ -163,12 +166,9 @@ def pose_of(rows: Rows) -> Pose:
     back = rows_back(rows)
     (xx, xy, xz, x), (_, _, yz, y), (_, _, zz, z) = back
     across = xx if isinstance(xy, float) and xy == 0.0 else torch.hypot(*torch.broadcast_tensors(*_tensors(xx, xy)))
-    return Pose(
-        *(step if isinstance(step, Tensor) else None for step in (x, y, z)),
-        _angle(_negative(yz), zz),
-        _angle(xz, across),
-        _angle(_negative(xy), xx),
-    )
+    decentres: dict[str, Any] = {name: d for name, d in zip("xyz", (x, y, z), strict=True) if isinstance(d, Tensor)}
+    tilts = _angle(_negative(yz), zz), _angle(xz, across), _angle(_negative(xy), xx)
+    return Pose(tilt_x=tilts[0], tilt_y=tilts[1], tilt_z=tilts[2], **decentres)
 
 
 def decentred_first(pose: Pose) -> Pose:

@@ -59,18 +59,18 @@ def lens(
         message = f"catalogs: {missing[0]!r} is no shipped catalog, and no file of {ENVIRONMENT} has this name"
         raise BadPrescription(f"{message}; expected some of {', '.join(SHIPPED)}, or the path of its AGF file there")
     surfaces = [surface(row, number, catalogs) for number, row in enumerate(rows, 1)]
-    wavelengths = _vector(wavelengths, "wavelengths")
-    weights = torch.ones_like(wavelengths) if wavelength_weights is None else _vector(wavelength_weights, "weights")
+    samples = _vector(wavelengths, "wavelengths")
+    weights = torch.ones_like(samples) if wavelength_weights is None else _vector(wavelength_weights, "weights")
     kind = field_kind or ("angle" if math.isinf(float(object_distance)) else "object_height")
     if kind not in FIELD_UNITS:
         raise BadPrescription(f"field_kind {kind!r}: expected one of {', '.join(FIELD_UNITS)}")
-    points = field_points(fields, like=wavelengths)
+    points = field_points(fields, like=samples)
     built = Lens(
         surfaces=(Surface(_tensor(object_distance)), *surfaces, Surface(_tensor(0.0))),
         stop=stop,
         aperture=_aperture(aperture),
         fields=Fields(kind, points[0], points[1], torch.ones_like(points[0])),
-        wavelengths=wavelengths,
+        wavelengths=samples,
         wavelength_weights=weights,
         primary_wavelength=primary_wavelength,
         name=name,
@@ -78,7 +78,7 @@ def lens(
         ray_aiming=ray_aiming,
     )
     try:
-        check_unit(wavelengths, (surface.glass for surface in built.surfaces))
+        check_unit(samples, (surface.glass for surface in built.surfaces))
         check(built)
     except ValueError as error:
         raise BadPrescription(str(error)) from error
@@ -114,15 +114,15 @@ def _aperture(apertures: Mapping[str, float]) -> SystemAperture:
     return SystemAperture(names[name], _tensor(number))
 
 
-def _is_empty(value) -> bool:
+def _is_empty(value: object) -> bool:
     return value is None or (isinstance(value, float) and math.isnan(value))
 
 
-def _tensor(value) -> Tensor:
-    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+def _tensor(number: Tensor | float) -> Tensor:
+    return number if isinstance(number, Tensor) else torch.as_tensor(number, dtype=torch.float64)
 
 
-def _vector(numbers, quantity: str) -> Tensor:
+def _vector(numbers: Sequence[float], quantity: str) -> Tensor:
     try:
         return torch.as_tensor(numbers, dtype=torch.float64).reshape(-1)
     except (TypeError, ValueError) as error:

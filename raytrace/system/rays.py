@@ -32,13 +32,13 @@ class Rays:
     wavelength: Tensor | None = None
 
     @property
-    def shape(self):
+    def shape(self) -> torch.Size:
         """Batch shape of the rays."""
         return self.direction.shape[1:]
 
 
 def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Rays:
-    """Rays from points and directions of any length; what is not finite or has no direction is lost from the start.
+    """Rays from points and directions of any length; rays without direction, or with infinite numbers, are invalid.
 
     position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
     """

@@ -1,9 +1,9 @@
 """Sag terms: D(x, y), added to the conic and even terms of a surface, z = S(r²) + D(x, y).
 
     GridSag         D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
-    SplineSag       the same by its coefficients c, computed once
+    SplineSag       that spline by its coefficients c, computed once
     ZernikeSag      D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
-    FringeSag       the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
+    FringeSag       D = Σ_j c_j F_j((x - x_0)/R, (y - y_0)/R), the fringe polynomials, which are 1 at the rim
     PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
     IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
     TiltSag         D = x tan_x + y tan_y
@@ -18,6 +18,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,12 +26,12 @@ from torch.utils._pytree import tree_leaves
 
 from raytrace.maths.bivariate import Sag, degree, polynomial_xy, powers, round_power, shifted, zernike_to_powers
 from raytrace.maths.numerics import broadcast_shape, polynomial, value
-from raytrace.maths.zernike import Order, fringe, harmonics, jacobi, noll, norm
+from raytrace.maths.zernike import Jacobi, Order, fringe, harmonics, jacobi, noll, norm
 from raytrace.system.poses import cos_sin
 
 _LEAST = 4  # points along a side of a grid: a cubic
 _FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
-_BLOCK = 128  # coefficients that are found together
+_BLOCK = 128  # coefficients that are computed together
 _FRINGE_DEGREE = 5  # of powers that fringe terms hold
 
 
@@ -41,7 +42,7 @@ class GridSag:
     Row 0 lies at the smallest y, column 0 at the smallest x. The spline is cubic with continuous second derivatives;
     at the ends the third derivative is continuous at the last point but one ("not a knot"), so that the error falls as
     pitch⁴ up to the rim. The surface ends half a pitch beyond the outermost points: a ray that crosses farther out
-    misses it. Every meeting of rays and surface finds the coefficients of the spline anew: see `spline`.
+    misses it. The coefficients of the spline are computed anew for every batch of rays: see `spline`.
     """
 
     heights: Tensor
@@ -58,7 +59,7 @@ class SplineSag:
 
 @value
 class ZernikeSag:
-    """Noll's polynomials from j = 1 on: coefficients (J,) mm RMS over the disc of `radius` mm; it goes on beyond."""
+    """Noll's polynomials from j = 1: coefficients (J,) mm RMS over the disc of `radius` mm, valid beyond it too."""
 
     coefficients: Tensor
     radius: Tensor
@@ -66,7 +67,7 @@ class ZernikeSag:
 
 @value
 class FringeSag:
-    """The fringe polynomials from j = 1 on: coefficients (J,) mm at the rim of the disc of `radius` mm; it goes on.
+    """The fringe polynomials from j = 1: coefficients (J,) mm at the rim of the disc of `radius` mm, valid beyond too.
 
     centre_x, centre_y: mm, the centre of the disc.
     """
@@ -78,7 +79,7 @@ class FringeSag:
 
 
 def spline(grid: GridSag) -> SplineSag:
-    """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
+    """The spline of a grid, in float64, differentiable in the heights: a lens traced many times computes it once.
 
     Raises ValueError for a grid of fewer than 4 × 4 heights.
     """
@@ -114,7 +115,7 @@ def fringe_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 
 
 def _spline_coefficients(heights: Tensor) -> Tensor:
-    """Coefficients (n + 2, ...) along the first axis of heights (n, ...); each feels only its surroundings."""
+    """Coefficients (n + 2, ...) along the first axis of heights (n, ...); each depends on the heights near it alone."""
     count = len(heights)
     matrix = _prefilter(count).to(heights)
     parts = []
@@ -155,7 +156,7 @@ def spline_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) ->
 
 
 def _weights(place: Tensor, count: int, highest: int) -> tuple[Tensor, list[Sequence[Tensor]]]:
-    """First of the four coefficients (...) that a point feels, and their weights with `highest` derivatives by place.
+    """The first of the four coefficients (...) at a point, and their weights with `highest` derivatives by place.
 
     place: (...) in pitches from the middle; beyond the edge it is held there.
     """
@@ -166,7 +167,7 @@ def _weights(place: Tensor, count: int, highest: int) -> tuple[Tensor, list[Sequ
     cell = place.detach().floor().clamp(0, count - 2)
     f = place - cell
     g = 1 - f
-    weights = [(g**3 / 6, (f**2 * (3 * f - 6) + 4) / 6, (g**2 * (3 * g - 6) + 4) / 6, f**3 / 6)]
+    weights: list[Sequence[Tensor]] = [(g**3 / 6, (f**2 * (3 * f - 6) + 4) / 6, (g**2 * (3 * g - 6) + 4) / 6, f**3 / 6)]
     if highest > 0:
         slopes = (-0.5 * g**2, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f**2)
         weights.append([inside * w for w in slopes])
@@ -193,7 +194,7 @@ def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -
 
 
 def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
-    """The same of the fringe terms, which are 1 at the rim."""
+    """Σ_j c_j F_j of the fringe terms at points (...) mm."""
     c, radius, centre_x, centre_y = (number.to(x.dtype) for number in numbers)
     terms = [(fringe(j), a) for j, a in enumerate(c.unbind(0), 1)]
     return _summed(terms, radius, x - centre_x, y - centre_y, highest)
@@ -202,7 +203,8 @@ def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) ->
 def _summed(terms: Sequence[tuple[Order, Tensor]], radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
     """Σ_m (Σ_k c_mk P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
     x, y = torch.broadcast_tensors(x / radius, y / radius)
-    t, known, radial = 2 * (x * x + y * y) - 1, {}, {}
+    t, known = 2 * (x * x + y * y) - 1, Jacobi()
+    radial: dict[int, list[Tensor]] = {}
     for (n, m), c in terms:
         parts = [c * p for p in jacobi(known, n, m, t, highest)]
         radial[m] = [a + b for a, b in zip(radial[m], parts, strict=True)] if m in radial else parts
@@ -237,7 +239,7 @@ class PolynomialSag:
 
 @value
 class IrregularSag:
-    """Errors of making by their height in mm at `radius` mm: spherical aberration, astigmatism and coma.
+    """Errors of fabrication by their height in mm at `radius` mm: spherical aberration, astigmatism and coma.
 
     angle: degrees, by which astigmatism and coma are turned from y.
     """
@@ -251,7 +253,7 @@ class IrregularSag:
 
 @value
 class TiltSag:
-    """A plane that leans: its slopes along x and y, tangents."""
+    """A tilted plane: its slopes along x and y, tangents."""
 
     tan_x: Tensor
     tan_y: Tensor
@@ -269,7 +271,7 @@ class PowerSag:
 
 
 def as_polynomial(sag_terms: IrregularSag | TiltSag) -> PolynomialSag:
-    """The same as a sum of powers."""
+    """An irregular sag or a tilted plane as a sum of powers."""
     if isinstance(sag_terms, TiltSag):
         return PolynomialSag(torch.stack([sag_terms.tan_x, sag_terms.tan_y]), torch.ones_like(sag_terms.tan_x))
     cosine, sine = cos_sin(sag_terms.angle)
@@ -299,21 +301,21 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 
 
 def powers_of_polynomial(sag_terms: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
-    """The same as powers about the vertex."""
-    given = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
-    zero = torch.zeros_like(given.radius)
-    return PowerSag(zero, zero, given.radius, zero, given.coefficients)
+    """A sum of powers about the vertex as powers about a centre."""
+    polynomial = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
+    zero = torch.zeros_like(polynomial.radius)
+    return PowerSag(zero, zero, polynomial.radius, zero, polynomial.coefficients)
 
 
 def powers_of_fringe(sag_terms: FringeSag) -> PowerSag:
-    """The same as powers about its centre."""
+    """Fringe terms as powers about their centre."""
     orders = [fringe(j) for j in range(1, len(sag_terms.coefficients) + 1)]
     height, powers_ = _powers_of(orders, sag_terms.coefficients)
     return PowerSag(sag_terms.centre_x, sag_terms.centre_y, sag_terms.radius, height, powers_)
 
 
 def powers_of_zernike(sag_terms: ZernikeSag) -> PowerSag:
-    """The same as powers about the vertex."""
+    """Noll's terms as powers about the vertex."""
     orders = [noll(j) for j in range(1, len(sag_terms.coefficients) + 1)]
     norms = sag_terms.coefficients.new_tensor([norm(*order) for order in orders])
     height, powers_ = _powers_of(orders, norms * sag_terms.coefficients)
@@ -330,8 +332,8 @@ def _powers_of(orders: Sequence[Order], coefficients: Tensor) -> tuple[Tensor, T
 def power_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
     """The height and the powers at points (...) mm."""
     centre_x, centre_y, radius, height, coefficients = (number.to(x.dtype) for number in numbers)
-    found = polynomial_sag((coefficients, radius), x - centre_x, y - centre_y, highest)
-    return found._replace(z=found.z + height)
+    sag = polynomial_sag((coefficients, radius), x - centre_x, y - centre_y, highest)
+    return sag._replace(z=sag.z + height)
 
 
 def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
@@ -342,23 +344,23 @@ def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 
 @dataclasses.dataclass(frozen=True)
 class SagTermKind:
-    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
+    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, computed once for a batch of rays.
 
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
     prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
-    axes: of each of its numbers itself; further ones vary from lens to lens, and from ray to ray.
-    powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
+    axes: of each of its numbers in one lens; further axes vary from lens to lens, and from ray to ray.
+    powers: to powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
     traced by torch alone.
     """
 
     sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
     size: Callable[[Sequence[Tensor], Tensor], Tensor]
     covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda _, x, y: torch.ones_like(x, dtype=torch.bool)
-    prepare: Callable = lambda sag_terms: sag_terms
+    prepare: Callable[[Any], "SagTerms"] = lambda sag_terms: sag_terms
     is_round: bool = False
     axes: tuple[int, ...] = (1, 0)
-    powers: Callable | None = None
+    powers: Callable[[Any], PowerSag] | None = None
     compiled: int | None = None
 
 
@@ -378,13 +380,13 @@ SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | Irregu
 
 @dataclasses.dataclass(frozen=True)
 class Relief:
-    """sag terms made ready for rays: its row, by the name of its class, and its numbers."""
+    """Sag terms prepared for rays: the row, by the name of the class, and its numbers."""
 
     kind: str
     numbers: Sequence[Tensor]
 
     def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
-        """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
+        """D (...) mm and derivatives up to the `highest`; beyond the edge of a grid, D is that of the edge."""
         return SAG_TERMS[self.kind].sag(self.numbers, x, y, highest)
 
     def covers(self, x: Tensor, y: Tensor) -> Tensor:
@@ -401,18 +403,18 @@ class Relief:
         return broadcast_shape(*(number.shape[axes:] for number, axes in self._with_axes()))
 
     def flat(self, batch: Sequence[int]) -> "Relief":
-        """The same with the numbers that vary for the rays of a batch in one axis."""
+        """The sag terms for the rays of a batch in one axis, along which their numbers vary."""
         numbers = []
         for number, axes in self._with_axes():
             if number.dim() > axes:
-                own, trailing = number.shape[:axes], number.shape[axes:]
-                number = number.reshape(*own, *(1,) * (len(batch) - len(trailing)), *trailing)
-                number = number.expand(*own, *batch).reshape(*own, -1)
+                inner, trailing = number.shape[:axes], number.shape[axes:]
+                number = number.reshape(*inner, *(1,) * (len(batch) - len(trailing)), *trailing)
+                number = number.expand(*inner, *batch).reshape(*inner, -1)
             numbers.append(number)
         return Relief(self.kind, numbers)
 
     def of(self, few: Tensor) -> "Relief":
-        """The same for few of the rays of one axis."""
+        """The sag terms for some of the rays of one axis."""
         numbers = [number[..., few] if number.dim() > axes else number for number, axes in self._with_axes()]
         return Relief(self.kind, numbers)
 
@@ -421,7 +423,7 @@ class Relief:
 
 
 def relief(sag_terms: SagTerms) -> Relief:
-    """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
+    """Sag terms prepared for rays. Raises ValueError for a grid of fewer than 4 × 4 heights."""
     name = type(sag_terms).__name__
     return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])
 
@@ -439,34 +441,39 @@ def with_powers(sag_terms: SagTerms | None, coefficients: Tensor, radius: Tensor
     zero = torch.zeros_like(radius)
     if sag_terms is None:
         return PowerSag(zero, zero, radius, zero, coefficients)
-    given = SAG_TERMS[type(sag_terms).__name__].powers(sag_terms)
-    terms = _scaled(coefficients, given.radius / radius)
+    before = _powers(sag_terms)
+    terms = _scaled(coefficients, before.radius / radius)
     if isinstance(sag_terms, FringeSag | PowerSag):
-        height, terms = shifted(terms, given.centre_x / given.radius, given.centre_y / given.radius)
-        given = dataclasses.replace(given, height=given.height + height)
-    entries = itertools.zip_longest(given.coefficients.unbind(0), terms, fillvalue=zero)
+        height, terms = shifted(terms, before.centre_x / before.radius, before.centre_y / before.radius)
+        before = dataclasses.replace(before, height=before.height + height)
+    entries = itertools.zip_longest(before.coefficients.unbind(0), terms, fillvalue=zero)
     sums = [a if b is zero else b if a is zero else a + b for a, b in entries]
-    return dataclasses.replace(given, coefficients=torch.stack(torch.broadcast_tensors(*sums)))
+    return dataclasses.replace(before, coefficients=torch.stack(torch.broadcast_tensors(*sums)))
+
+
+def _powers(sag_terms: SagTerms) -> PowerSag:
+    """Sag terms as powers about a centre. Raises ValueError for a grid of heights, which is no such sum."""
+    convert = SAG_TERMS[type(sag_terms).__name__].powers
+    if convert is None:
+        raise ValueError("a grid of heights is no sum of powers")
+    return convert(sag_terms)
 
 
 def about_vertex(sag_terms: SagTerms) -> tuple[PolynomialSag, Tensor]:
-    """The same as a sum of powers about the vertex, and the height () mm to be added to it.
+    """Sag terms as a sum of powers about the vertex, and the height () mm to be added to it.
 
     Raises ValueError for a grid of heights, which is no such sum.
     """
-    row = SAG_TERMS[type(sag_terms).__name__]
-    if row.powers is None:
-        raise ValueError("a grid of heights is no sum of powers")
-    given = row.powers(sag_terms)
-    if not bool(given.centre_x.any() | given.centre_y.any()):
-        return PolynomialSag(given.coefficients, given.radius), given.height
-    centre = -given.centre_x / given.radius, -given.centre_y / given.radius
-    height, terms = shifted(given.coefficients.unbind(0), *centre)
-    return PolynomialSag(torch.stack(torch.broadcast_tensors(*terms)), given.radius), given.height + height
+    terms = _powers(sag_terms)
+    if not bool(terms.centre_x.any() | terms.centre_y.any()):
+        return PolynomialSag(terms.coefficients, terms.radius), terms.height
+    centre = -terms.centre_x / terms.radius, -terms.centre_y / terms.radius
+    height, coefficients = shifted(terms.coefficients.unbind(0), *centre)
+    return PolynomialSag(torch.stack(torch.broadcast_tensors(*coefficients)), terms.radius), terms.height + height
 
 
 def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
-    """The same as a sum of fringe terms over a disc of twice the radius; None for powers of a degree above 5.
+    """A sum of powers as fringe terms over a disc of twice the radius; None for powers of a degree above 5.
 
     The 36 terms with n + |m| ≤ 10 hold every power to x⁵ … y⁵. Piston makes the sag at the vertex 0.
     """
@@ -479,10 +486,10 @@ def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
     terms = torch.cat([terms, terms.new_zeros(size - len(terms))])
     numbers = [j for j in range(2, 37) if fringe(j)[0] <= highest]
     matrix, constants = (terms.new_tensor(part) for part in zernike_to_powers(tuple(map(fringe, numbers))))
-    found = torch.linalg.solve(matrix, terms)
-    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers) - 1,), found)
+    heights = torch.linalg.solve(matrix, terms)
+    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers) - 1,), heights)
     zero = torch.zeros_like(radius)
-    return FringeSag(torch.cat([-(constants @ found)[None], coefficients[1:]]), radius, zero, zero)
+    return FringeSag(torch.cat([-(constants @ heights)[None], coefficients[1:]]), radius, zero, zero)
 
 
 def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> PolynomialSag:
@@ -493,9 +500,10 @@ def with_even_terms(sag_terms: PolynomialSag, coefficients: Tensor) -> Polynomia
         for n, a in enumerate(coefficients.unbind(0), 1)
         for power, factor in round_power(n).items()
     }
-    order = powers(max(len(sag_terms.coefficients), highest * (highest + 3) // 2))
-    zero = torch.zeros_like(radius)
-    pairs = itertools.zip_longest(sag_terms.coefficients.unbind(0), order, fillvalue=zero)
+    terms = [*sag_terms.coefficients.unbind(0)]
+    order = powers(max(len(terms), highest * (highest + 3) // 2))
+    terms += [torch.zeros_like(radius)] * (len(order) - len(terms))
+    pairs = zip(terms, order, strict=True)
     return PolynomialSag(torch.stack([a + even[power] if power in even else a for a, power in pairs]), radius)
 
 
@@ -509,13 +517,12 @@ def _with_heights(grid: GridSag | SplineSag, coefficients: Tensor, radius: Tenso
     """A grid with the heights of powers at its points."""
     if coefficients.dim() > 1:
         raise ValueError("a surface with a grid of heights cannot vary from lens to lens; expected one lens at a time")
-    is_grid = isinstance(grid, GridSag)
-    rows, columns = grid.heights.shape if is_grid else (count - 2 for count in grid.coefficients.shape)
+    rows, columns = grid.heights.shape if isinstance(grid, GridSag) else (size - 2 for size in grid.coefficients.shape)
     y, x = (
         (torch.arange(count, dtype=coefficients.dtype, device=coefficients.device) - 0.5 * (count - 1)) * grid.pitch
         for count in (rows, columns)
     )
     heights = polynomial_xy(coefficients, x / radius, y[:, None] / radius, 0).z
-    if is_grid:
+    if isinstance(grid, GridSag):
         return dataclasses.replace(grid, heights=grid.heights + heights)
     return dataclasses.replace(grid, coefficients=grid.coefficients + spline(GridSag(heights, grid.pitch)).coefficients)

@@ -19,18 +19,19 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.bivariate import Sag
-from raytrace.maths.numerics import polynomial
+from raytrace.maths.numerics import Number, polynomial
 
 EVEN = "even asphere"
 _TIP = 1e-24  # mm²: r² up to which a ray goes through the vertex
 
 
-#: What terms add to a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope
-#: and f² times its second derivative; None for those above the highest. The b_j are at least 0.
-Terms = Callable[[Tensor, Tensor, int, Tensor | float], tuple[Tensor, Tensor | None, Tensor | None]]
+#: The terms of a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope and
+#: f² times its second derivative; None for those above the highest. The b_j are at least 0.
+Sums = tuple[Tensor, Tensor | None, Tensor | None]
+Terms = Callable[[Tensor, Tensor, int, Tensor | float], Sums]
 
 
-def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float) -> Sums:
     """b_j = u^j, as `Terms`."""
     P = u * polynomial(coefficients, u)
     if highest == 0:
@@ -44,7 +45,7 @@ def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | fl
     return P, dP, polynomial(second[1:], u) * along * along
 
 
-def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float) -> Sums:
     """b_j = r^j, as `Terms`: those of even j, and r q(u) with q = a_1 + a_3 u + …
 
     The cone a_1 r has no slope at its tip: a ray through the vertex sees the mean of all directions, 0.
@@ -56,16 +57,16 @@ def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | flo
     r = torch.sqrt(torch.where(apart, u, 1.0))
     dr, r = torch.where(apart, 0.5 / r, 0.0), torch.where(apart, r, 0.0)
     S = S + r * q
-    if highest == 0:
+    if dS is None or dq is None:
         return S, None, None
     dS = dS + dr * q + r * dq
-    if highest == 1:
+    if d2S is None or d2q is None:
         return S, dS, None
     turn = dr * along
     return S, dS, d2S + r * d2q + 2 * turn * (dq * along) - 2 * dr * turn * turn * q
 
 
-def conic_sag(u, c, w):
+def conic_sag(u: Number, c: Number, w: Number) -> Number:
     """c u/(1+w) of u = r² and the root w = √(1 - (1+k) c² u). Any number type."""
     return c * u / (1 + w)
 
@@ -112,7 +113,7 @@ def _section(c: Tensor, k: Tensor, a: Tensor, y: Tensor, highest: int) -> tuple[
     return S, 2 * dS * y, 2 * dS + 4 * d2S
 
 
-def _toroid(c, k, a, x, y, highest: int) -> Sag:
+def _toroid(c: Tensor, k: Tensor, a: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
     """w = 1 - c_x z gives w z_x = c_x x and w z_y = q g', and these the second derivatives."""
     c_x, zero = a[0], torch.zeros_like(x * y)
     g, dg, d2g = _section(c, k, a[1:], y, highest)
@@ -134,13 +135,13 @@ def _toroid(c, k, a, x, y, highest: int) -> Sag:
     return Sag(z, z_x, z_y, turn * (1 + z_x * z_x), turn * z_x * z_y, z_yy)
 
 
-def _toroid_covers(c, k, a, x, y) -> Tensor:
+def _toroid_covers(c: Tensor, k: Tensor, a: Tensor, x: Tensor, y: Tensor) -> Tensor:
     g, *_ = _section(c, k, a[1:], y, 0)
     q = 1 - a[0] * g
     return (1 - (1 + k) * (c * (c * (y * y))) > 0) & (q > 0) & (q > (a[0] * x).abs())
 
 
-def _toroid_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
+def _toroid_extent(c: Tensor, k: Tensor, a: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
     along_y = _edge(c, k, limit)
     y = torch.linspace(0, 1, 17, dtype=c.dtype, device=c.device).reshape(-1, *(1,) * along_y.dim()) * along_y
     q = 1 - a[0] * _section(c, k, a[1:], y * (1 - 1e-8), 0)[0]
@@ -148,7 +149,7 @@ def _toroid_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
     return torch.where((a[0] != 0) & (reach < limit), reach, limit), along_y
 
 
-def _biconic(c, k, a, x, y, highest: int) -> Sag:
+def _biconic(c: Tensor, k: Tensor, a: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
     """z (1 + w) = c_x x² + c y², derived twice; w w_x = -(1+k_x) c_x² x."""
     c_x, shape_x, shape_y = a[0], 1 + a[1], 1 + k
     zero = torch.zeros_like(x * y)
@@ -177,29 +178,29 @@ def _biconic(c, k, a, x, y, highest: int) -> Sag:
     )
 
 
-def _biconic_covers(c, k, a, x, y) -> Tensor:
+def _biconic_covers(c: Tensor, k: Tensor, a: Tensor, x: Tensor, y: Tensor) -> Tensor:
     p, q = a[0] * x, c * y
     return 1 - (1 + a[1]) * (p * p) - (1 + k) * (q * q) > 0
 
 
-def _biconic_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
-    """A section that stays open along one axis moves the edge along the other one out."""
+def _biconic_extent(c: Tensor, k: Tensor, a: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """A section that stays open along one axis moves the edge along the other axis outwards."""
     open_x, open_y = (
         torch.sqrt(1 + (-(1 + conic) * (bend * limit) ** 2).clamp_min(0.0)) for bend, conic in ((a[0], a[1]), (c, k))
     )
     return (_edge(a[0], a[1], limit) * open_y).minimum(limit), (_edge(c, k, limit) * open_x).minimum(limit)
 
 
-def _size(c, a, x, y, terms: Tensor | float = 0.0) -> Tensor:
+def _size(c: Tensor, a: Tensor, x: Tensor, y: Tensor, terms: Tensor | float = 0.0) -> Tensor:
     return (c * y * y).abs() + (a[0] * x * x).abs() + terms
 
 
-def _toroid_size(c, a, x, y) -> Tensor:
+def _toroid_size(c: Tensor, a: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return _size(c, a, x, y, even_terms(y * y, a[1:].abs(), 0, 1.0)[0])
 
 
 def _edge(c: Tensor, k: Tensor, limit: Tensor) -> Tensor:
-    """Where a conic closes, at most the limit."""
+    """The radius at which a conic closes, at most the limit."""
     closed = (1 + k) * c * c
     return torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), limit).minimum(limit)
 
@@ -210,16 +211,16 @@ BICONIC = Form(_biconic, _biconic_covers, _biconic_extent, _size)
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of sag: of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or of a form of its
+    """A kind of sag: a conic with rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or a form.
 
     terms: the sum and its derivatives.
     form: the whole sag of a kind that is not round; curvature and conic are those of its section along y.
-    heads: names of the first coefficients of such a kind; only then come the a_j, of y² … or none.
-    least, most: how many coefficients it has.
+    heads: names of the first coefficients of such a kind, which the a_j of y² … follow, if it has any.
+    least, most: the smallest and largest number of its coefficients.
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: entries of the column "type" of a table; an empty one is resolved by the powers of the terms.
-    code: its place in `Kind` of tracing/cpp/sags.h, which traces up to `compiled` coefficients; None: torch alone does.
+    code: its place in `Kind` of tracing/cpp/sags.h, which traces up to `compiled` coefficients; None: torch traces it.
     """
 
     name: str
@@ -241,7 +242,7 @@ class Kind:
         return self.form is None
 
     def name_of(self, entry: int) -> str:
-        """What a coefficient is called, counted from 0: a4 is that of r⁴, or of y⁴."""
+        """The name of a coefficient, counted from 0: a4 is that of r⁴, or of y⁴."""
         heads = len(self.heads)
         return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
 
@@ -264,5 +265,5 @@ KINDS = {
 
 
 def size_of_terms(u: Tensor, coefficients: Tensor, kind: str = EVEN) -> Tensor:
-    """Σ_j |a_j| b_j (...): what the terms add up from, by which their rounding is judged."""
+    """Σ_j |a_j| b_j (...), the size of the terms, by which their rounding is judged."""
     return KINDS[kind].terms(u, coefficients.abs(), 0, 1.0)[0]

@@ -15,20 +15,20 @@ from torch import Tensor
 
 from raytrace.materials.environment import Environment
 from raytrace.materials.glass import AIR, Glass
-from raytrace.maths.numerics import is_any, value
+from raytrace.maths.numerics import Number, is_any, value
 from raytrace.system.apertures import Aperture
 from raytrace.system.phases import Phase, kind_of, power_of
-from raytrace.system.poses import Gap, Pose, Turn, decentred_first, tilted_first, without_z
+from raytrace.system.poses import Gap, Pose, decentred_first, tilted_first, without_z
 from raytrace.system.sag_terms import SAG_TERMS, Sag, SagTerms, relief
 from raytrace.system.shapes import EVEN, KINDS, conic_terms
 
 
 @value
 class Surface:
-    """One surface of a lens and the gap behind it. What is None is not modelled, and costs nothing.
+    """One surface of a lens and the gap behind it. Fields that are None are not modelled.
 
     thickness: mm from this vertex to the next; the object's may be inf.
-    curvature: c, 1/mm; None is a plane for good (a tensor of 0 makes a plane's curvature differentiable).
+    curvature: c, 1/mm; None is a plane (a tensor of 0 makes a plane's curvature differentiable).
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of the `kind`, a key of `shapes.KINDS`: of an even asphere of r², r⁴, … in
         mm^(1-2j), of a toroid its curvature along x and terms of y², y⁴, …; None if not aspheric.
@@ -54,7 +54,7 @@ class Surface:
     kind: str = EVEN
     sag_terms: SagTerms | None = None
     phase: Phase | None = None
-    before: Pose | Turn | None = None
+    before: Pose | None = None
     after: Pose | None = None
     is_break: bool = False
     glass: Glass = AIR
@@ -67,6 +67,11 @@ class Surface:
     def radius(self) -> Tensor:
         """mm, 1 / curvature; inf of a plane."""
         return torch.full_like(self.thickness, torch.inf) if self.curvature is None else 1 / self.curvature
+
+    @property
+    def pose(self) -> Pose | None:
+        """The pose before the surface, None without one; in the compiled trace a passage is in its place."""
+        return self.before if isinstance(self.before, Pose) else None
 
     @property
     def is_mirror(self) -> bool:
@@ -147,7 +152,7 @@ def is_freeform(surface: Surface) -> bool:
 
 
 def is_even(surface: Surface) -> bool:
-    """Whether the surface is a centred conic with at most the terms of an even asphere, as other programs have them."""
+    """Whether the surface is a centred conic with at most the terms of an even asphere, a type of all lens programs."""
     plain = surface.sag_terms is None and surface.phase is None and not is_posed(surface)
     return plain and (surface.coefficients is None or surface.kind == EVEN)
 
@@ -163,29 +168,16 @@ def vertex_curvature(surface: Surface) -> Tensor:
     Of a toroid or a biconic it is that of the section along y, as in other programs. The curvatures of sag terms along
     x and y are averaged. Slopes at the vertex, of sag terms or of an odd asphere, are ignored.
     """
-    along_y, added = _vertex(surface)[1:]
-    return along_y if added is None else along_y + 0.5 * (added.xx + added.yy)
-
-
-def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The curvatures in 1/mm of the sections along x and along y at the vertex, sag terms included."""
-    along_x, along_y, added = _vertex(surface)
-    return (along_x, along_y) if added is None else (along_x + added.xx, along_y + added.yy)
-
-
-def _vertex(surface: Surface) -> tuple[Tensor, Tensor, Sag | None]:
-    """The curvatures at the vertex along x and y without sag terms, and the sag terms there."""
-    if surface.curvature is not None and surface.coefficients is None and surface.sag_terms is None:
-        return surface.curvature, surface.curvature, None
     centre = torch.zeros_like(surface.thickness)
-    added = None if surface.sag_terms is None else relief(surface.sag_terms).sag(centre, centre)
-    if is_freeform(surface):
-        base = freeform_sag(surface, centre, centre, 2)
-        return base.xx, base.yy, added
     total = centre if surface.curvature is None else surface.curvature
-    if surface.coefficients is not None:
-        total = total + 2 * KINDS[surface.kind].terms(centre, surface.coefficients, 1, 1.0)[1]
-    return total, total, added
+    if is_freeform(surface):
+        total = freeform_sag(surface, centre, centre, 2).yy
+    elif surface.coefficients is not None:
+        total = total + 2 * sag_and_derivatives(centre, None, None, surface.coefficients, 1, kind=surface.kind)[1]
+    if surface.sag_terms is None:
+        return total
+    added = relief(surface.sag_terms).sag(centre, centre)
+    return total + 0.5 * (added.xx + added.yy)
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
@@ -199,7 +191,7 @@ def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
 
 
 def sag_at(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-    """Sag z in mm at points (...) mm of any surface; beyond its edge that of the edge."""
+    """Sag z in mm of any surface at points (...) mm; beyond the edge of a closed conic, the sag of the edge."""
     z = freeform_sag(surface, x, y, 0).z if is_freeform(surface) else round_sag(surface, x * x + y * y, 0)[0]
     return z if surface.sag_terms is None else z + relief(surface.sag_terms).sag(x, y, highest=0).z
 
@@ -220,10 +212,10 @@ def sag_and_derivatives(
     along: Tensor | float = 1.0,
     kind: str = EVEN,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
+    """S(u), dS/du, v² d²S/du² with u = r² (...) in mm²; derivatives above the `highest` are 0.
 
-    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
-    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
+    along: v; the second derivative has the factor v² because c³ alone leaves the range of numbers before any length or
+    curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
 
     S = c u/(1+w) + Σ_j a_j b_j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
     """
@@ -239,16 +231,18 @@ def sag_and_derivatives(
 
 
 def freeform_sag(surface: Surface, x: Tensor, y: Tensor, highest: int) -> Sag:
-    """The sag of a kind that is not round, without sag terms."""
-    a = surface.coefficients
+    """The sag of a kind that is not round, without sag terms. Raises TypeError for a round surface."""
+    form, a = KINDS[surface.kind].form, surface.coefficients
+    if form is None or a is None:
+        raise TypeError(f"a round surface (kind {surface.kind!r}); expected a kind that is not round")
     c, k = (a.new_zeros(()) if number is None else number for number in (surface.curvature, surface.conic))
-    return KINDS[surface.kind].form.sag(c, k, a, x, y, highest)
+    return form.sag(c, k, a, x, y, highest)
 
 
 # -- paraxial refraction and the y-nu trace: ω = n u of a slope u = dy/dz, n signed, negative towards -z ---------------
 
 
-def signed(surfaces: Sequence[Surface], indices: Sequence) -> list:
+def signed(surfaces: Sequence[Surface], indices: Sequence[Number]) -> list[Number]:
     """Indices made negative where light travels towards -z; indices: before and behind the surfaces, one more."""
     side, result = 1, [indices[0]]
     for surface, n in zip(surfaces, indices[1:], strict=True):
@@ -263,8 +257,8 @@ def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor |
     return refractive if surface.phase is None else refractive + power_of(surface.phase, wavelength)[1]
 
 
-def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
-    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
+def ynu(y: Number, omega: Number, powers: Sequence[Number], gaps: Sequence[Number]) -> list[tuple[Number, Number]]:
+    """(y, ω) of a paraxial ray before each surface, and behind the last surface, or behind its gap if that is given.
 
     powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
     """

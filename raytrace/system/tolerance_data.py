@@ -1,4 +1,4 @@
-"""Tolerances: errors of manufacture as rows, each a kind of KINDS, and what an error of each kind changes.
+"""Tolerances: errors of manufacture as rows, each of a kind of KINDS, and their effect on a lens.
 
 A row is a number that differs from its nominal value within limits: a radius, a thickness, the tilt of an element. Its
 value, the error, is in the row's own unit. Rows hold plain numbers, so that two sets compare by their parts.
@@ -32,13 +32,13 @@ from raytrace.system.surface import Surface
 #: Distributions of an error between its limits, and OpticStudio's number of each.
 DISTRIBUTIONS = {
     "normal": "truncated at the limits, which lie `sigmas` standard deviations from their middle",
-    "uniform": "all values between the limits alike",
+    "uniform": "all values between the limits are equally likely",
     "parabolic": "density rising with the square of the distance from the middle of the limits",
-    "end_points": "one limit or the other, each in half of the cases",
+    "end_points": "one of the two limits, each with probability 1/2",
     "table": "linear between the points of `density`",
 }
 
-#: The last number of the terms of a kind: Noll's, and the fringe terms.
+#: The highest term of a kind: of Noll's and of the fringe terms.
 MOST_TERM = {"zernike": 231, "fringe": 37}
 
 #: The test wavelength of fringes unless a file has another, in µm: a helium-neon laser.
@@ -47,7 +47,7 @@ TEST_WAVELENGTH = 0.6328
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """One number that differs from its nominal value: its kind, where it is, and its limits.
+    """A number that differs from its nominal value: its kind, its surfaces and its limits.
 
     kind: a key of `KINDS`, as "radius", "thickness", "element_tilt_x".
     surfaces: its surface (k,); the first and last surface (k, l) of an element or a group, which may be the same; ()
@@ -55,12 +55,13 @@ class Tolerance:
     minimum, maximum: limits of the error in `unit`, that of the kind by default; a radius or an Abbe number may be in
         "%" of its value.
     distribution: a key of `DISTRIBUTIONS`; sigmas: of "normal", how many standard deviations the limits are away.
-    adjust: of a thickness, the surface whose thickness changes by the opposite, so that all that follows stays; None.
-    pivot: of the tilt of an element, how far behind the vertex of its first surface its axis lies, mm.
+    adjust: of a thickness, the surface whose thickness changes by the opposite, which keeps the surfaces behind it in
+        place; None: no surface.
+    pivot: of the tilt of an element, the distance of its axis behind the vertex of its first surface, mm.
     parameter: of "parameter", a name of `parameter_paths`, as "a4", "tilt_x".
     term: of "zernike", Noll's number of the term; of "fringe", that of the fringe terms.
-    group: rows of one group, as the components of a radial decentre, are drawn together: in a direction that is random
-        in all n of them alike, by √n times what the distribution of a row gives. At its limits all are at once.
+    group: the n rows of a group, such as the components of a radial decentre, are drawn together: a random direction in
+        n dimensions, times √n, times a number from the distribution of a row. All reach their limits at once.
     density: of the distribution "table": fractions of the way from `minimum` to `maximum`, rising, and the density.
     configuration, operand: of "operand", the configuration (from 1) and its place in `lens.operands` (from 0).
     source: file and line, or the grade that the limits come from.
@@ -83,7 +84,7 @@ class Tolerance:
     operand: int | None = None
     source: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.unit and self.kind in KINDS:
             object.__setattr__(self, "unit", KINDS[self.kind].unit)
 
@@ -108,7 +109,7 @@ class Tolerance:
 
 @dataclass(frozen=True, slots=True)
 class Compensator:
-    """A number that is adjusted after manufacture, to undo part of the errors.
+    """A number that is adjusted after manufacture, which compensates part of the errors.
 
     surface, parameter: as of `Vary`: "thickness", "curvature", "conic", or another name of `parameter_paths`.
     minimum, maximum: limits of its change, mm, 1/mm or degrees.
@@ -134,7 +135,7 @@ class Compensator:
 
 
 class Gauge(NamedTuple):
-    """What an error of a surface is measured by.
+    """The reference of an error of a surface.
 
     semi_diameter: h mm, None where it is unknown; wavelength: λ of the test in mm; angle: θ of irregularity in degrees,
     (...) as the errors; path: where the surface holds the number of a "parameter".
@@ -223,6 +224,7 @@ def _abbe(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) -> Surf
 
 
 def _parameter(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) -> Surface:
+    assert gauge.path is not None
     return with_number(surface, gauge.path, number_at(surface, gauge.path) + error)
 
 

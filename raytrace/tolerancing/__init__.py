@@ -1,6 +1,6 @@
-"""Tolerances: errors of manufacture as values, and lenses with such errors.
+"""Tolerancing: errors of manufacture as values, and lenses with such errors.
 
-tolerances      `Tolerances`: rows, compensators and the wavelength of the test
+table           `ToleranceTable`: rows, compensators and the wavelength of the test
 elements        elements and cemented groups of a lens, found from its media and mirrors
 perturbation    `perturbed`: the lens with an error for each row, one lens or many
 sampling        `draw_errors`: random errors, the same for a trial in any batch
@@ -9,9 +9,9 @@ criteria        RMS spot radius, RMS wavefront, MTF, merit, change of the PSF, b
 study           `Study`: a criterion as a function of errors and compensators, its best compensators, its second order
 tightening      limits by inverse sensitivity, and those of a yield at least total tightness
 monte_carlo     the criterion of random lenses, resumable
-toleranced      `tolerance` and its result: sensitivities, expectation, trials, table and figure
+analysis        `tolerance_analysis` and its result: sensitivities, expectation, trials, table and figure
 as_built        `AsBuilt`: the expectation as a term of a merit function, with exact derivatives
-grades          `tolerances`: rows of published grades and of limits
+grades          `tolerance_table`: rows of published grades and of limits
 jacobian        `jacobian`: derivatives of any quantity by design variables and errors
 
 A kind of error is a row of `KINDS` in `system/tolerance_data.py`.

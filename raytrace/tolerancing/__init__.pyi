@@ -1,3 +1,5 @@
+from raytrace.tolerancing.analysis import Toleranced as Toleranced
+from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
 from raytrace.tolerancing.elements import lens_elements as lens_elements
@@ -7,6 +9,4 @@ from raytrace.tolerancing.jacobian import Jacobian as Jacobian
 from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
-from raytrace.tolerancing.toleranced import Toleranced as Toleranced
-from raytrace.tolerancing.toleranced import tolerance as tolerance
-from raytrace.tolerancing.tolerances import Tolerances as Tolerances
+from raytrace.tolerancing.table import Tolerances as Tolerances

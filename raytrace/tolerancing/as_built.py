@@ -26,10 +26,10 @@ from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
-from raytrace.tolerancing.grades import tolerances as tolerances_of
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.study import focuses, moments, sampling_of
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.spot import image_rays
@@ -42,7 +42,7 @@ _ANGLES = 45.0, 22.5
 
 
 class Unlit(BadTolerance, NoLight):
-    """A sample of lenses with one through which no ray of a field passes."""
+    """In a lens of the sample no ray of a field passes."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,21 @@ class AsBuilt:
     E[q] is the expected mean square spot radius of the manufactured and refocused lens, in the square of the unit of
     length of the merit function; of merit="spot" M² is that of the nominal lens.
 
-    grade, limits: of `tolerances`, by default those of the lens's file; tolerances: instead of both. weight: above 0;
-    a large one minimises the lens as built alone. fields: as of `tolerance`, by default those of the lens, mirrored
-    along y; rings, arms: of the pupil. Raises BadTolerance, ValueError.
+    grade, limits: of `tolerance_table`, by default those of the lens's file; tolerances: instead of both. weight: above
+    0; a large one minimises the lens as built alone. fields: as of `tolerance_analysis`, by default those of the lens,
+    mirrored along y; rings, arms: of the pupil. Raises BadTolerance, ValueError.
     """
 
     grade: str | None = None
     limits: str | Sequence[str] = ""
     _: KW_ONLY
-    tolerances: Tolerances | None = None
+    tolerances: ToleranceTable | None = None
     weight: float = 1.0
     fields: Tensor | Sequence | None = None
     rings: int = 3
     arms: int = 6
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 0 < self.weight < float("inf"):
             raise ValueError(f"{option('weight')} {self.weight:g} of the lens as built: expected a number above 0")
         if self.tolerances is not None and (self.grade or self.limits):
@@ -83,7 +83,7 @@ class AsBuilt:
 
 
 class AsBuiltTerm:
-    """The sample of errors for one lens, and what it gives for any lens of the same surfaces.
+    """The sample of errors of one lens, and the expectation of any lens with the same surfaces.
 
     Limits and semi-diameters, to which fringes and runouts refer, are those of this lens. Apertures clip no ray, as in
     a merit function.
@@ -92,7 +92,7 @@ class AsBuiltTerm:
     def __init__(self, settings: AsBuilt, lens: Lens):
         prepare()
         self.settings, rows = settings, settings.tolerances
-        self.tolerances = tolerances_of(lens, settings.limits, grade=settings.grade) if rows is None else rows
+        self.tolerances = tolerance_table(lens, settings.limits, grade=settings.grade) if rows is None else rows
         if not len(self.tolerances):
             raise BadTolerance(f"no tolerances; give a {option('grade')}, {option('limits')} or `tolerances`")
         self.limits = _focus_limits(lens, self.tolerances)
@@ -109,7 +109,7 @@ class AsBuiltTerm:
         return f"{len(self.tolerances)} tolerances, {self.settings.words()}"
 
     def about(self) -> str:
-        """All that the term depends on besides the lens."""
+        """Everything on which the term depends besides the lens."""
         rows = [dataclasses.astuple(row) for row in (*self.tolerances, *self.tolerances.compensators)]
         numbers = [self.sampling.fields, self.sampling.field_weights, self.sampling.points, self.weights]
         return repr(
@@ -155,10 +155,10 @@ class AsBuiltTerm:
 
     # -- residuals of least squares ------------------------------------------------------------------------------------
 
-    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray | None, int]:
+    def residuals(self, state: LensState, unit: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Residuals (R,) of sum weight · E[q], squared, their derivatives (R, n), and the number of failed rays.
 
-        unit: mm in the unit of length of the merit function. Derivatives of a state that has them, else None.
+        unit: mm in the unit of length of the merit function; n: 0 of a state without derivatives.
         """
         factor = (self.settings.weight / len(self.errors)) ** 0.5 / unit
         with torch.set_grad_enabled(state.count > 0):
@@ -166,11 +166,11 @@ class AsBuiltTerm:
                 self.lenses(state.moving_lens(), self.errors), self.sampling.points, fields=self.sampling.fields
             )
             offsets = factor * self._offsets(rays.position, rays.direction, rays.valid).reshape(-1)
-        slopes = tangents_of(offsets, state.count).detach().numpy().T if state.count else None
+        slopes = tangents_of(offsets, state.count).detach().numpy().T
         return value_of(offsets).detach().numpy(), slopes, int((~rays.valid).sum())
 
 
-def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:
+def _focus_limits(lens: Lens, tolerances: ToleranceTable) -> tuple[float, float]:
     """Limits in mm of the motion of the sensor, 0 and 0 without a compensator. Raises BadTolerance."""
     compensators = tolerances.compensators
     if not compensators:
@@ -187,7 +187,7 @@ def _focus_limits(lens: Lens, tolerances: Tolerances) -> tuple[float, float]:
 # -- the sample --------------------------------------------------------------------------------------------------------
 
 
-def design(tolerances: Tolerances) -> Tensor:
+def design(tolerances: ToleranceTable) -> Tensor:
     """Errors (L, N) of the sample in the rows' units, float64."""
     mean, variance = (np.array(part) for part in zip(*map(moments, tolerances), strict=True))
     signs = hadamard(len(tolerances) + 1)[:, 1 : len(tolerances) + 1]
@@ -199,12 +199,11 @@ def design(tolerances: Tolerances) -> Tensor:
 
 
 def hadamard(least: int) -> np.ndarray:
-    """A Hadamard matrix of the smallest order from `least` that Paley's and Sylvester's constructions have; its first
-    column is 1."""
+    """A Hadamard matrix of the smallest order from `least` by Paley's and Sylvester's constructions, first column 1."""
     order = max(least, 1)
-    while (found := _hadamard(order)) is None:
+    while (matrix := _hadamard(order)) is None:
         order += 1
-    return found
+    return matrix
 
 
 def _hadamard(order: int) -> np.ndarray | None:
@@ -217,8 +216,8 @@ def _hadamard(order: int) -> np.ndarray | None:
         squares[np.arange(1, q) ** 2 % q] = True
         character = np.where(squares, 1.0, -1.0)
         character[0] = 0.0
-        found = np.ones((order, order))
-        found[1:, 1:] = character[(np.arange(q) - np.arange(q)[:, None]) % q] - np.eye(q)
-        return found
+        matrix = np.ones((order, order))
+        matrix[1:, 1:] = character[(np.arange(q) - np.arange(q)[:, None]) % q] - np.eye(q)
+        return matrix
     half = _hadamard(order // 2) if order % 2 == 0 else None
     return None if half is None else np.block([[half, half], [half, -half]])

@@ -1,8 +1,8 @@
-"""Criteria: measures of image quality that a lens as built is judged by, of a batch of lenses in one pass.
+"""Criteria: measures of image quality of lenses as built, of a batch of lenses in one pass.
 
-A criterion f comes of a quantity q that the compensators minimise: f = √q where q is a mean square, f = 1 - q of the
-MTF. The mean square radius of spots is a parabola in the position of a plane sensor, whose minimum needs no second
-trace.
+A criterion f is a function of a quantity q that the compensators minimise: f = √q where q is a mean square, f = 1 - q
+of the MTF. The mean square radius of spots is a parabola in the position of a plane sensor, whose minimum needs no
+second trace.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from raytrace.maths.sampling import square
 from raytrace.optimization.merit import DefaultMerit, Merit, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.psf_models.models import DRT, Gaussian, psf
+from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row
 from raytrace.system.rays import Rays
@@ -59,7 +60,7 @@ class Criterion:
     quantity: q (L,) of a batch of lenses, ready for rays (`aligned`). parabola: q₀, q₁, q₂ (L,) of q₀ + 2 s q₁ + s² q₂
     with the sensor s mm further along its normal; None: no closed form. value: f of q; quantity_of: q of f; sign: -1
     where a larger f is better. scale: of q, where it is 0 for the nominal lens. together: lenses traced at once with
-    derivatives. settings: what q depends on beyond lens, fields and pupil. angle: radians of a unit, 0 for no angle.
+    derivatives. settings: on which q depends besides lens, fields and pupil. angle: radians of a unit, 0 for no angle.
     allows_idle: whether compensators without effect on q stay at 0; else they are refused.
     """
 
@@ -87,7 +88,8 @@ def _spot_parabola(lens: Lens, sampling: Sampling) -> tuple[Tensor, Tensor, Tens
     scene, points, weights = sampling.of(lens)
     rays, weights = trace_scene(scene, points), (wavelength_shares(lens)[:, None] * weights).flatten(-2)
     together = Rays(rays.position.flatten(-2), rays.direction.flatten(-2), rays.valid.flatten(-2))
-    return tuple(1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+    q0, q1, q2 = (1e6 * (sampling.field_weights * part).sum(-1) for part in spot_parabola(together, weights))
+    return q0, q1, q2
 
 
 def _mean_square_angle(lens: Lens, sampling: Sampling) -> Tensor:
@@ -122,7 +124,7 @@ def _wavefront_variance(lens: Lens, sampling: Sampling) -> Tensor:
 
 
 def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
-    """Mean of tangential and sagittal MTF over the fields; q is what is missing to 1."""
+    """Mean of tangential and sagittal MTF over the fields; q = 1 - MTF."""
     pupils = ShearedPupils(lens, sampling.fields, frequency)
 
     def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
@@ -130,27 +132,29 @@ def _modulation(frequency: float, lens: Lens, sampling: Sampling) -> Criterion:
         return 1 - (sampling.field_weights * 0.5 * (tangential + sagittal)).sum(-1)
 
     name = f"MTF at {frequency:g} cycles/mm"
-
-    def missing(number):
-        return 1 - number
-
-    return Criterion(name, "", quantity, value=missing, quantity_of=missing, sign=-1, scale=1.0, together=32)
+    return Criterion(
+        name, "", quantity, value=lambda q: 1 - q, quantity_of=lambda f: 1 - f, sign=-1, scale=1.0, together=32
+    )
 
 
-def _psf_change(lens: Lens, sampling: Sampling, model: str, pixel: float | None, size) -> Criterion:
+def _psf_change(
+    lens: Lens, sampling: Sampling, model: str, pixel: float | None, size: int | tuple[int, int] | None
+) -> Criterion:
     """RMS difference of PSFs from the nominal lens's, relative to that PSF, over the fields."""
-    kinds = {"gaussian": Gaussian, "drt": DRT}
+    kinds: dict[str, type[Gaussian] | type[DRT]] = {"gaussian": Gaussian, "drt": DRT}
     if model not in kinds:
         raise ValueError(f"model {model!r}: expected one of {', '.join(kinds)}{did_you_mean(model, kinds)}")
-    options = {"fields": sampling.fields, "pixel": pixel, "size": size}
+
+    def kernels(lens: Lens, model: str | Gaussian | DRT) -> Psf:
+        return psf(lens, model, fields=sampling.fields, pixel=pixel, size=size)
 
     with torch.no_grad():
-        order = psf(lens, model, **options).order
-        nominal = psf(lens, kinds[model](order=order), **options).kernel
+        order = kernels(lens, model).order
+        nominal = kernels(lens, kinds[model](order=order)).kernel
     energy = nominal.square().sum((-2, -1))
 
     def quantity(lenses: Lens, sampling: Sampling) -> Tensor:
-        kernel = psf(lenses, kinds[model](order=order), **options).kernel
+        kernel = kernels(lenses, kinds[model](order=order)).kernel
         change = (kernel - nominal).square().sum((-2, -1)) / energy
         return (sampling.field_weights * change).sum(-1)
 
@@ -177,7 +181,7 @@ def _boresight(lens: Lens, sampling: Sampling) -> Criterion:
     return Criterion("boresight error", "µm", quantity, scale=1.0, angle=angle, allows_idle=True)
 
 
-def _merit(lens: Lens, merit) -> Criterion:
+def _merit(lens: Lens, merit: Merit | DefaultMerit | Sequence[Row] | str | None) -> Criterion:
     """A merit function, of the file or as `optimize` takes it; q is its square."""
     function = merit_for(lens, merit) if merit is None or isinstance(merit, Merit) else None
 
@@ -189,7 +193,7 @@ def _merit(lens: Lens, merit) -> Criterion:
     return Criterion("merit function", "", quantity, settings=(repr(rows.rows), rows.unit))
 
 
-#: Criteria of every lens by name, and those that are made of the nominal lens.
+#: Criteria of every lens by name; the others of NAMES depend on the nominal lens.
 CRITERIA = {
     "rms": Criterion("RMS spot radius", "µm", _mean_square_radius, _spot_parabola),
     "wavefront": Criterion("RMS wavefront", "waves", _wavefront_variance),
@@ -250,7 +254,7 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def at_best_focus(parabola: Sequence[Tensor], least: Tensor | float, most: Tensor | float) -> tuple[Tensor, Tensor]:
+def at_best_focus(parabola: Sequence[Tensor], least: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
     """The least of q₀ + 2 s q₁ + s² q₂ between limits of s, and s; (L,) each, differentiable."""
     q0, q1, q2 = parabola
     shift = torch.clamp(shift_to_focus(q1, q2), least, most)

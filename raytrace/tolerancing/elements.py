@@ -46,7 +46,7 @@ def _media(lens: Lens) -> list[Glass]:
     return [lens.surfaces[number].glass for number in medium_surfaces(lens.surfaces)]
 
 
-def _same(one: Glass, other: Glass) -> bool:
+def _same(glass: Glass, other: Glass) -> bool:
     """Whether two media are alike, so that no ray refracts between them."""
-    named = (one.name, one.catalog, one.formula) == (other.name, other.catalog, other.formula)
-    return one is other or (named and torch.equal(one.coefficients, other.coefficients))
+    alike = (glass.name, glass.catalog, glass.formula) == (other.name, other.catalog, other.formula)
+    return glass is other or (alike and torch.equal(glass.coefficients, other.coefficients))

@@ -1,4 +1,4 @@
-"""The tolerances of a lens file: those of its own lines."""
+"""The tolerances of a lens file, of its lines TOL."""
 
 from os import PathLike, fspath
 from pathlib import Path
@@ -9,10 +9,10 @@ from raytrace.io.source import LensFileError, Place, read_text
 from raytrace.io.zemax.surfaces import records
 from raytrace.io.zemax.tolerances import read_lines
 from raytrace.system.lens import Lens
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 
 
-def read_tolerances(path: str | PathLike, **options: Any) -> Tolerances:
+def read_tolerances(path: str | PathLike, **options: Any) -> ToleranceTable:
     """The tolerances of a .zmx file: TRAD, TTHI, TETX … as rows, COMP and CPAR as compensators, TWAV, STAT, SAVE.
 
     options: of `read_lens`. Operands that are not read are listed in `unread`, each with the reason; see [Tolerances](
@@ -23,14 +23,16 @@ def read_tolerances(path: str | PathLike, **options: Any) -> Tolerances:
         raise LensFileError("no lines of tolerances (TOL); give limits or a grade by `tolerances`", Place(file))
     numbers = []
     if Path(path).suffix.lower() == ".zmx":
-        numbers = [record.place.line for record in records(read_text(Path(path)), file) if record.keyword in _LINES]
-    return Tolerances(*read_lines(lens, lens.optimization_data.tolerances, file, numbers))
+        numbers = [
+            record.place.line or 0 for record in records(read_text(Path(path)), file) if record.keyword in _LINES
+        ]
+    return ToleranceTable(*read_lines(lens, lens.optimization_data.tolerances, file, numbers))
 
 
 _LINES = ("TOL", "TCMM")
 
 
-def tolerances_of(lens: Lens) -> Tolerances:
-    """The tolerances of the file that a lens comes from; none where it has no lines of them."""
+def tolerances_of(lens: Lens) -> ToleranceTable:
+    """The tolerances of the file of a lens; an empty table where it has none."""
     lines = () if lens.optimization_data is None else lens.optimization_data.tolerances
-    return Tolerances(*read_lines(lens, lines))
+    return ToleranceTable(*read_lines(lens, lines))

@@ -10,7 +10,7 @@ GRADES has the figures of each grade and where they are printed.
 import dataclasses
 import re
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from raytrace.materials.glass import has_abbe_number, is_air
 from raytrace.system.lens import Lens
@@ -19,7 +19,7 @@ from raytrace.system.tolerance_data import KINDS, TEST_WAVELENGTH, Compensator, 
 from raytrace.tolerancing.elements import cemented_groups, lens_elements
 from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.perturbation import check_tolerances
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.words import did_you_mean, option
 
@@ -76,7 +76,7 @@ GRADES = {
 
 
 class Parts(NamedTuple):
-    """Where a lens has errors: its faces, glasses (surface in front, last surface of its group), gaps and elements.
+    """Parts of a lens that have errors: faces, glasses (surface in front, last surface of the group), gaps, elements.
 
     faces: surfaces where the light refracts or reflects; ends: the last face of every element of glass, whose wedge it
     has; gaps: surfaces in front of air between elements; units: cemented groups and single elements, which are mounted.
@@ -130,7 +130,7 @@ def _both(kind: str) -> tuple[str, ...]:
     return f"{kind}_x", f"{kind}_y"
 
 
-#: Words of limits that are no kinds, or have places of their own.
+#: Words of limits that are no kinds, or that apply to particular places.
 WORDS = {
     "radius": Word(("radius",), _faces, ("radius", "power", "curvature")),
     "power": Word(("power",), _faces, ("radius", "power", "curvature")),
@@ -153,7 +153,7 @@ WORDS = {
 _LIMITS = re.compile(r"([a-z_]+)(?::([\d,-]+))?=(?:([^%]+?)\.\.)?([^%]+?)(%?)")
 
 
-def tolerances(
+def tolerance_table(
     lens: Lens,
     limits: str | Sequence[str] = "",
     *,
@@ -161,7 +161,7 @@ def tolerances(
     distribution: str = "normal",
     sigmas: float = 2.0,
     compensators: Sequence[Compensator] | None = None,
-) -> Tolerances:
+) -> ToleranceTable:
     """The tolerances of every surface, element and gap of a lens: of a grade, of limits, or of its file.
 
     limits: "radius=0.1% thickness=0.02 element_tilt=0.05": words and kinds with their limits ± in mm, degrees, fringes
@@ -171,7 +171,7 @@ def tolerances(
         the lens's own file.
     distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "parabolic" or "end_points", of rows
         that the file does not have.
-    compensators: what is adjusted after manufacture; by default those of the file for its own tolerances, of which
+    compensators: numbers adjusted after manufacture; by default those of the file for its own tolerances, of which
         there may be none, and the distance of the sensor for those of a grade or of limits alone.
 
     A thickness of glass is taken up by the first gap of air behind it. Raises BadTolerance.
@@ -179,14 +179,15 @@ def tolerances(
     if grade is not None and grade not in GRADES:
         raise BadTolerance(f"grade {grade!r}{did_you_mean(grade, GRADES)}: expected one of {', '.join(GRADES)}")
     words = _parsed(joined(limits))
-    stored = tolerances_of(lens) if grade is None else Tolerances(())
+    stored = tolerances_of(lens) if grade is None else ToleranceTable(())
     if not (grade or words or stored.rows):
         limits_or_grade = f'{option("limits")}, as "radius=0.1%", or {option("grade")}, as "precision"'
         message = f"the lens has no tolerances of its own: give {limits_or_grade}"
         raise BadTolerance(message)
-    parts, drawn = parts_of(lens), {"distribution": distribution, "sigmas": sigmas}
+    parts = parts_of(lens)
+    drawn: dict[str, Any] = {"distribution": distribution, "sigmas": sigmas}
     rows = list(stored.rows)
-    for word, figure in GRADES.get(grade, {}).items():
+    for word, figure in GRADES[grade].items() if grade else ():
         rows += _rows(lens, parts, _Limit(word, (), -figure.limit, figure.limit, figure.unit, figure.source), drawn)
     if grade:
         rows = _at_least_fringes(lens, rows, GRADES[grade]["radius"])
@@ -203,6 +204,10 @@ def tolerances(
     return dataclasses.replace(stored, rows=tuple(rows), compensators=tuple(compensators), saves=saves)
 
 
+#: Former name.
+tolerances = tolerance_table
+
+
 class _Limit(NamedTuple):
     word: str
     surfaces: tuple[int, ...]
@@ -214,7 +219,7 @@ class _Limit(NamedTuple):
 
 def _parsed(text: str) -> list[_Limit]:
     """The limits of a text. Raises BadTolerance naming the word."""
-    found = []
+    limits = []
     for piece in text.split():
         match = _LIMITS.fullmatch(piece)
         if not match:
@@ -237,12 +242,12 @@ def _parsed(text: str) -> list[_Limit]:
             raise BadTolerance(
                 f"{piece!r}: the limits {minimum:g} to {maximum:g}; expected a positive number, or -1..3"
             )
-        found.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
-    return found
+        limits.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
+    return limits
 
 
 def _word(name: str) -> Word:
-    """The word, or that of a kind."""
+    """The `Word` of a word of limits or of a kind."""
     if name in WORDS:
         return WORDS[name]
     whole = WORDS.get(name.removesuffix("_x").removesuffix("_y"))
@@ -261,7 +266,7 @@ def _replaces(limit: _Limit, row: Tolerance, parts: Parts) -> bool:
     return True
 
 
-def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict) -> list[Tolerance]:
+def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict[str, Any]) -> list[Tolerance]:
     """The rows of a limit at all its places, or at those of its surfaces."""
     word = _word(limit.word)
     places = [place for place in word.where(parts) if not limit.surfaces or place[0] in limit.surfaces]
@@ -274,40 +279,41 @@ def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict) -> list[Toleranc
     ends, rows = dict(parts.glasses), []
     for place in places:
         for kind in word.kinds:
-            if kind == "radius" and _is_plane(lens, place[0]):
+            if kind == "radius" and not _curvature(lens, place[0]):
                 continue
             if kind == "abbe" and not has_abbe_number(lens.surfaces[place[0]].glass):
                 continue
-            known = drawn | {"unit": limit.unit, "source": limit.source}
-            low, high = limit.minimum, limit.maximum
+            row = Tolerance(kind, tuple(place), limit.minimum, limit.maximum, source=limit.source)
             if kind == "irregularity_angle":
-                low, high, known = -90.0, 90.0, {"distribution": "uniform", "source": limit.source}
-            if kind == "thickness" and place[0] in ends:
-                known |= {"adjust": ends[place[0]]}
-            rows.append(Tolerance(kind, tuple(place), low, high, **known))
+                rows.append(dataclasses.replace(row, minimum=-90.0, maximum=90.0, distribution="uniform"))
+                continue
+            adjust = ends.get(place[0]) if kind == "thickness" else None
+            rows.append(dataclasses.replace(row, unit=limit.unit, adjust=adjust, **drawn))
     return rows
 
 
-def _is_plane(lens: Lens, k: int) -> bool:
+def _curvature(lens: Lens, k: int) -> float:
     curvature = lens.surfaces[k].curvature
-    return curvature is None or float(curvature) == 0
+    return 0.0 if curvature is None else float(curvature)
 
 
 def _at_least_fringes(lens: Lens, rows: Iterable[Tolerance], figure: Figure) -> list[Tolerance]:
-    """Rows whose radius may differ by more in fringes than by its part, in fringes; planes with them.
+    """The rows, with radii in fringes where the fringes of the grade are the larger limit, and with rows for planes.
 
     N fringes of λ/2 at the semi-diameter h are a part N λ |R|/h² of a radius R.
     """
-    radii, found = semi_diameters(lens), []
+    radii, changed = semi_diameters(lens), []
     for row in rows:
         if row.kind == "radius":
             k = row.surfaces[0]
-            h, curvature = radii[k], abs(float(lens.surfaces[k].curvature))
+            h, curvature = radii[k], abs(_curvature(lens, k))
             if h > 0 and 100 * figure.fringes * 1e-3 * TEST_WAVELENGTH / (curvature * h * h) > figure.limit:
                 n = figure.fringes
                 row = dataclasses.replace(row, kind="power", minimum=-n, maximum=n, unit="fringes")
-        found.append(row)
-    planes = [k for k in parts_of(lens).faces if _is_plane(lens, k) and radii[k] > 0]
-    known = {"distribution": found[0].distribution, "sigmas": found[0].sigmas} if found else {}
-    n = figure.fringes
-    return found + [Tolerance("power", (k,), -n, n, source=figure.source, **known) for k in planes]
+        changed.append(row)
+    planes = [k for k in parts_of(lens).faces if not _curvature(lens, k) and radii[k] > 0]
+    n, usual = figure.fringes, changed[0] if changed else Tolerance("power", (0,), 0.0, 0.0)
+    return changed + [
+        Tolerance("power", (k,), -n, n, distribution=usual.distribution, sigmas=usual.sigmas, source=figure.source)
+        for k in planes
+    ]

@@ -1,22 +1,21 @@
 """Derivatives of rays, merit functions, and any function of a lens by its design variables and its errors, in one pass.
 
-The lens is made of tensors that carry their derivatives (`maths.tangents`) by all variables, those that solves and
-pickups bring about included, and by all errors of manufacture, and the quantity is computed from it once, as without
-derivatives: by the compiled trace where that carries the rays, else by torch. Nothing is held fixed: rays are launched
-and aimed anew with every number.
+The numbers of the lens are tensors that carry their derivatives (`maths.tangents`) by all variables, through solves and
+pickups, and by all errors of manufacture. The quantity is computed from this lens once: by the compiled trace where it
+supports the surfaces, else by torch. Launch and ray aiming follow every number.
 """
 
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.result import Column, Columns, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
 from raytrace.optimization.variables import DesignVariables, design_variables, name_of
@@ -24,9 +23,9 @@ from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.grades import tolerances as tolerances_of
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.perturbation import Perturbation
-from raytrace.tolerancing.tolerances import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import rays
 from raytrace.tracing.trace import trace_lens
 from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value, option
@@ -71,11 +70,11 @@ class Jacobian(Result):
         return {"variable": self.variables}
 
     def tables(self) -> list[Table]:
-        columns = {**self.columns(), "variable": [*self.variables]}
+        columns: Columns = {**self.columns(), "variable": [*self.variables]}
         shape = " × ".join(map(str, self.value.shape)) or "one number"
         return [Table(columns, [f"derivatives of {self.quantity} ({shape}) by {len(self.variables)} numbers"])]
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         return {
             "analysis": "jacobian",
             "quantity": self.quantity,
@@ -95,6 +94,7 @@ def _directions(end: Rays) -> Tensor:
 
 
 def _paths(end: Rays) -> Tensor:
+    assert end.opl is not None
     return end.opl
 
 
@@ -111,7 +111,7 @@ def jacobian(
     vary: str | Sequence[str | Vary] | None = None,
     *,
     of: str | Callable[[Lens], Tensor] = "landing points",
-    tolerances: Tolerances | Iterable[Tolerance] | None = None,
+    tolerances: ToleranceTable | Iterable[Tolerance] | None = None,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
     fields: Tensor | Sequence | None = None,
@@ -126,8 +126,8 @@ def jacobian(
     less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,)
     of a merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor
     (...), as lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0,
-    as of `perturbed`; grade, limits: as of `tolerances` instead. Derivatives are exact to rounding; failed rays have 0.
-    Raises BadVariables, BadTolerance, TypeError, ValueError.
+    as of `perturbed`; grade, limits: as of `tolerance_table` instead. Derivatives are exact to rounding; failed rays
+    have 0. Raises BadVariables, BadTolerance, TypeError, ValueError.
     """
     of_rays = [
         name
@@ -165,12 +165,12 @@ def jacobian(
             )
         errors = 0 if perturbation is None else len(perturbation.rows)
         start = torch.from_numpy(np.append(model.start, np.zeros(errors)))
-        at = with_tangents(start, torch.eye(len(start), dtype=start.dtype))
+        numbers = with_tangents(start, torch.eye(len(start), dtype=start.dtype))
         with torch.enable_grad():
-            moving = model.lens_at(at[: len(model.variables)])
-            moving = moving if perturbation is None else perturbation(at[len(model.variables) :], moving)
+            moving = model.lens_at(numbers[: len(model.variables)])
+            moving = moving if perturbation is None else perturbation(numbers[len(model.variables) :], moving)
         quantity, derivatives = derivatives_of(function, moving, len(start))
-    rows = () if perturbation is None else Tolerances(perturbation.rows).labels
+    rows = () if perturbation is None else ToleranceTable(perturbation.rows).labels
     return Jacobian(
         quantity,
         derivatives,
@@ -181,14 +181,14 @@ def jacobian(
 
 
 def _perturbation(
-    lens: Lens, tolerances: Tolerances | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
+    lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance] | None, grade: str | None, limits: str | Sequence[str]
 ) -> Perturbation | None:
-    """The lens with the errors that are asked for; None: with none."""
+    """The lens with the errors of tolerances, None without tolerances."""
     if tolerances is not None and (grade or limits):
         raise ValueError(f"jacobian: `tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if tolerances is None and not (grade or limits):
         return None
-    return Perturbation(lens, tolerances_of(lens, limits, grade=grade) if tolerances is None else tolerances)
+    return Perturbation(lens, tolerance_table(lens, limits, grade=grade) if tolerances is None else tolerances)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:
@@ -211,19 +211,26 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
     return value_of(number).detach(), tangents_of(number, count).detach()
 
 
-def _of_rays(quantity: Callable[[Rays], Tensor], fields, wavelengths, pupil) -> Callable[[Lens], Tensor]:
+def _of_rays(
+    quantity: Callable[[Rays], Tensor],
+    fields: Tensor | Sequence | None,
+    wavelengths: Tensor | Sequence[float] | None,
+    pupil: Tensor | tuple[Tensor, Tensor] | None,
+) -> Callable[[Lens], Tensor]:
     def function(lens: Lens) -> Tensor:
         launched = rays(lens, fields=fields, pupil=pupil, wavelengths=wavelengths)
         if quantity is not _paths:
             launched = dataclasses.replace(launched, opl=None)
+        assert launched.wavelength is not None
         return quantity(trace_lens(aligned(lens, 3), launched, launched.wavelength))
 
     return function
 
 
-def _of_merit(model: DesignVariables, lens: Lens, merit) -> tuple[Tensor, Tensor]:
+def _of_merit(
+    model: DesignVariables, lens: Lens, merit: Merit | DefaultMerit | Sequence[Row] | str | None
+) -> tuple[Tensor, Tensor]:
     """The residuals (m,) of a merit function, whose squares sum up to M², and their derivatives (n, m)."""
     function = merit_for(lens, merit)
-    options = {"unit": function.unit, "skip_unknown": function.skip_unknown, "conventions": function.conventions}
-    evaluated = Evaluation(model, function.rows, **options)(model.start, derivatives=True)
+    evaluated = Evaluation(model, function.rows, **function.options)(model.start, derivatives=True)
     return torch.from_numpy(evaluated.residuals), torch.from_numpy(evaluated.jacobian.T.copy())

@@ -14,9 +14,11 @@ thickness: the axes from which rays start follow the vertex of surface 1.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -31,21 +33,23 @@ from raytrace.system.poses import Pose, Rows, pose_of, rows_along, rows_back, ro
 from raytrace.system.sag_terms import with_powers
 from raytrace.system.surface import Surface, with_z_in_thicknesses
 from raytrace.system.tolerance_data import KINDS, MOST_TERM, Compensator, Gauge, Tolerance
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, check_limits, rows_of
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable, check_limits, rows_of
 from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.trace import aiming_of
 from raytrace.words import did_you_mean
 
+_UNMEASURED = Gauge(None, 0.0)
+
 #: Parameters of an Irregular surface by the names of a lens.
 _IRREGULAR = {"x": 1, "y": 2, "tilt_x": 3, "tilt_y": 4, "spherical": 5}
 
 
-def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: Tensor | Sequence[float]) -> Lens:
+def perturbed(lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance], errors: Tensor | Sequence[float]) -> Lens:
     """The lens with an error for each tolerance.
 
-    tolerances: `Tolerances`, or rows; errors: (N,) in the rows' units, or (L, N) for L lenses at once, whose numbers
-    that differ from lens to lens then are (L, 1, 1, 1) and broadcast against rays (lens, field, wavelength, pupil).
+    tolerances: a table, or rows; errors: (N,) in the rows' units, or (L, N) for L lenses at once, whose numbers that
+    differ from lens to lens then are (L, 1, 1, 1) and broadcast against rays (lens, field, wavelength, pupil).
     Differentiable in the errors and in the lens. Numbers that no error touches stay the same tensors.
     A lens of several configurations is perturbed in all of them, and loses the others where an element moves whose
     thicknesses or poses differ between them: perturb each `lens.configuration(k)` then. Pickups and position solves
@@ -59,10 +63,10 @@ def perturbed(lens: Lens, tolerances: Tolerances | Iterable[Tolerance], errors: 
 class Perturbation:
     """A lens with its tolerances, checked once and applied to any errors: `perturbed` for many batches of one lens."""
 
-    def __init__(self, lens: Lens, tolerances: Tolerances | Iterable[Tolerance]):
+    def __init__(self, lens: Lens, tolerances: ToleranceTable | Iterable[Tolerance]):
         # The perturbed lens, whose axis bends, finds its stop as the nominal one does.
         self.lens, self.rows = with_ray_aiming(lens, aiming_of(lens)), rows_of(tolerances)
-        fringes = tolerances if isinstance(tolerances, Tolerances) else Tolerances(self.rows)
+        fringes = tolerances if isinstance(tolerances, ToleranceTable) else ToleranceTable(self.rows)
         self.wavelength = 1e-3 * fringes.test_wavelength
         check_tolerances(lens, self.rows)
         needed = any(KINDS[row.kind].needs_semi_diameter for row in self.rows)
@@ -90,7 +94,7 @@ class Perturbation:
         _follow(start, surfaces)
         numbers = list(surfaces)
         spread = [
-            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0])))
+            (row, k, f * KINDS[row.kind].step(value, gauges.get(row.surfaces[0], _UNMEASURED)))
             for row, value in pairs
             for k, f in _carriers(lens, row)
         ]
@@ -108,7 +112,7 @@ class Perturbation:
 def _gauges(
     lens: Lens, pairs: Sequence[tuple[Tolerance, Tensor]], wavelength: float, radii: Sequence[float] | None
 ) -> dict[int, Gauge]:
-    """What the errors of each surface are measured by; radii: the semi-diameters, where they are needed."""
+    """The references of the errors of each surface; radii: the semi-diameters, where they are needed."""
     angles: dict[int, Tensor] = {}
     for row, value in pairs:
         if row.kind == "irregularity_angle":
@@ -127,12 +131,12 @@ def _gauges(
 
 
 def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, gauges: dict[int, Gauge]) -> None:
-    """Change the number of a row; of a thickness, the adjusting one with it."""
+    """Change the number of a row, and with a thickness the adjusting thickness."""
     change = KINDS[row.kind].change
     if change is None:
         return
     k = row.surfaces[0]
-    gauge = gauges.get(k, Gauge(None, 0.0))
+    gauge = gauges.get(k, _UNMEASURED)
     if row.kind == "parameter":
         gauge = gauge._replace(path=path_of(lens.surfaces[k], row.parameter))
         surfaces[k] = modelled(surfaces[k], row.parameter)
@@ -141,8 +145,15 @@ def _change(lens: Lens, surfaces: list[Surface], row: Tolerance, value: Tensor, 
         surfaces[row.adjust] = change(surfaces[row.adjust], -value, row, gauge)
 
 
+def raised(surface: Surface, quantity: str, change: Tensor) -> Surface:
+    """The surface with a quantity larger by a change."""
+    path = path_of(surface, quantity)
+    assert path is not None  # the lens is checked
+    return with_number(surface, path, number_at(surface, path) + change)
+
+
 def path_of(nominal: Surface, quantity: str) -> ParameterPath | None:
-    """Where a surface holds a quantity; None: nowhere."""
+    """The path of a quantity of a surface, None if the surface does not have it."""
     if quantity == "thickness":
         return ParameterPath((quantity,))
     return parameter_paths(modelled(nominal, quantity)).get(quantity)
@@ -154,7 +165,7 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
     known: dict[tuple[int, str], Tensor | None] = {}
 
     def step(place: tuple[int, str]) -> Tensor | None:
-        """How much a number has changed; None: not at all."""
+        """The change of a number, None if it has not changed."""
         if place not in known:
             known[place] = None  # a number that follows itself stays
             known[place] = _solved(solves[place]) if place in solves else _difference(lens, surfaces, *place)
@@ -162,18 +173,17 @@ def _follow(lens: Lens, surfaces: list[Surface]) -> None:
 
     def _solved(solve: Solve) -> Tensor | None:
         if solve.kind == "pickup":
-            change = step((solve.source, solve.quantity_of_source or solve.quantity))
+            change = step(solve.address_of_source)
             return None if change is None else solve.scale * change
         k, source = solve.surface, solve.source
         others = range(source, k) if source <= k else range(k + 1, source)
         changes = [change for j in others if (change := step((j, "thickness"))) is not None]
-        return -sum(changes) if changes else None
+        return -functools.reduce(torch.add, changes) if changes else None
 
     changes = {place: step(place) for place in solves if solves[place].quantity != "glass"}
     for (k, quantity), change in changes.items():
         if change is not None:
-            surface, path = modelled(surfaces[k], quantity), path_of(lens.surfaces[k], quantity)
-            surfaces[k] = with_number(surface, path, number_at(surface, path) + change)
+            surfaces[k] = raised(modelled(surfaces[k], quantity), quantity, change)
     for (k, quantity), solve in solves.items():
         source = solve.source
         while (source, quantity) in solves and source != k:
@@ -186,15 +196,15 @@ def _solves(lens: Lens) -> dict[tuple[int, str], Solve]:
     """The pickups and position solves of the lens, by surface and quantity."""
     data = lens.optimization_data
     solves = () if data is None else data.solves
-    return {(s.surface, s.quantity): s for s in solves if s.kind in ("pickup", "position") and s.operand is None}
+    return {s.address: s for s in solves if s.kind in ("pickup", "position") and s.operand is None}
 
 
 def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) -> Tensor | None:
-    """How much a number differs from that of the lens; None where it is the same tensor, or none."""
-    old, new, path = lens.surfaces[k], surfaces[k], path_of(lens.surfaces[k], quantity)
-    if old is new or path is None:
+    """The difference of a number from that of the lens; None where it is the same tensor, or not modelled."""
+    path = path_of(lens.surfaces[k], quantity)
+    if lens.surfaces[k] is surfaces[k] or path is None:
         return None
-    old, new = (_part(surface, path) for surface in (old, new))
+    old, new = _part(lens.surfaces[k], path), _part(surfaces[k], path)
     if new is None or new is old:
         return None
     return (new if old is None else new - old)[() if path.entry is None else path.entry]
@@ -202,7 +212,7 @@ def _difference(lens: Lens, surfaces: Sequence[Surface], k: int, quantity: str) 
 
 def _part(surface: Surface, path: ParameterPath) -> Tensor | None:
     """The tensor at a path, of all its entries; None where it is not modelled."""
-    part = surface
+    part: Any = surface
     for name in path.path:
         part = getattr(part, name, None)
     return part
@@ -213,17 +223,17 @@ def _carriers(lens: Lens, row: Tolerance) -> list[tuple[int, float]]:
     kind = KINDS[row.kind]
     if kind.elements or not (kind.sag or kind.motion):
         return []
-    source, found = row.surfaces[0], [(row.surfaces[0], 1.0)]
+    source, carriers = row.surfaces[0], [(row.surfaces[0], 1.0)]
     data = lens.optimization_data
     for solve in () if data is None or not kind.parameter else data.kept:
         picked = solve.kind == "PPAR" and solve.quantity == f"PARM {kind.parameter}" and len(solve.numbers) > 1
         if picked and int(solve.numbers[0]) == source:
-            found.append((solve.surface, solve.numbers[1]))
+            carriers.append((solve.surface, solve.numbers[1]))
     for solve in () if data is None or not kind.parameter else data.solves:
         picked = solve.kind == "pickup" and _IRREGULAR.get(solve.quantity) == kind.parameter
         if picked and solve.source == source and not lens.surfaces[solve.surface].is_break:
-            found.append((solve.surface, solve.scale))
-    return found
+            carriers.append((solve.surface, solve.scale))
+    return carriers
 
 
 # -- sag terms --------------------------------------------------------------------------------------------------------
@@ -233,8 +243,9 @@ def _add_sags(surfaces: list[Surface], parts: Sequence[tuple[Tolerance, int, Ten
     """Add the powers of all errors of a surface to its sag."""
     sums: dict[tuple[int, float], list[Tensor]] = {}
     for row, k, value in parts:
-        gauge = gauges[row.surfaces[0]]
-        terms = KINDS[row.kind].sag(value, row, gauge)
+        gauge, sag = gauges[row.surfaces[0]], KINDS[row.kind].sag
+        assert sag is not None
+        terms = sag(value, row, gauge)
         old = sums.get((k, gauge.radius), [])
         pairs = itertools.zip_longest(old, terms)
         sums[k, gauge.radius] = [b if a is None else a if b is None else a + b for a, b in pairs]
@@ -253,17 +264,19 @@ def _move(
     parts: Sequence[tuple[Tolerance, int, Tensor]],
 ) -> list[tuple[int, int]]:
     """Move surfaces and elements rigidly; returns the first and last surface of each that moves."""
-    of_surfaces: dict[int, dict[str, Tensor]] = {}
+    of_surfaces: dict[int, dict[str, Any]] = {}
     for row, k, value in parts:
         _add_to(of_surfaces.setdefault(k, {}), KINDS[row.kind].motion, value)
-    of_elements: dict[tuple[int, int, float], dict[str, Tensor]] = {}
+    of_elements: dict[tuple[int, int, float], dict[str, Any]] = {}
     for row, value in pairs:
         kind = KINDS[row.kind]
         if kind.elements:
             _add_to(of_elements.setdefault((*_range(row), row.pivot), {}), kind.motion, value)
     # From the outermost to the innermost: a longer range holds a shorter one.
     ranges = sorted(of_elements, key=lambda place: place[0] - place[1])
-    still, before, behind = tuple(surfaces), defaultdict(list), defaultdict(list)
+    still = tuple(surfaces)
+    before: dict[int, list[Pose]] = defaultdict(list)
+    behind: dict[int, list[Rows]] = defaultdict(list)
     for first, last, pivot in ranges:
         motion, z = Pose(**of_elements[first, last, pivot]), still[first].thickness.new_tensor(pivot)
         motions = [Pose(z=z), motion, Pose(z=-z)] if pivot else [motion]
@@ -271,9 +284,9 @@ def _move(
         before[first] += motions
         behind[last].insert(0, rows_of_both(rows_of_both(rows_back(way), back), way))
     for k in {*before, *behind, *of_surfaces}:
-        surface, own = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
-        front = [pose for pose in (*before[k], surface.before, *own) if pose is not None]
-        rear = [pose for pose in (*map(undone, own), surface.after) if pose is not None]
+        surface, of_surface = still[k], [Pose(**of_surfaces[k])] if k in of_surfaces else []
+        front = [pose for pose in (*before[k], surface.before, *of_surface) if isinstance(pose, Pose)]
+        rear = [pose for pose in (*map(undone, of_surface), surface.after) if isinstance(pose, Pose)]
         rows = rows_along(rear)
         for element in behind[k]:
             rows = rows_of_both(rows, element)
@@ -286,7 +299,7 @@ def _move(
     return [(first, last) for first, last, _ in ranges] + [(k, k) for k in of_surfaces]
 
 
-def _add_to(motion: dict[str, Tensor], field: str, value: Tensor) -> None:
+def _add_to(motion: dict[str, Any], field: str, value: Tensor) -> None:
     motion[field] = motion[field] + value if field in motion else value
 
 
@@ -294,16 +307,16 @@ def _range(row: Tolerance) -> tuple[int, int]:
     return row.surfaces[0], row.surfaces[-1]
 
 
-def _way(surfaces: Sequence[Surface]) -> list[Pose | Tensor | None]:
+def _way(surfaces: Sequence[Surface]) -> list[Any]:
     """The poses and thicknesses from the axes in front of the first surface to those behind the last."""
-    steps: list[Pose | Tensor | None] = []
+    steps: list[Any] = []
     for surface in surfaces:
         steps += [surface.before, surface.after, surface.thickness]
     return steps[:-1]
 
 
 def _single(poses: Sequence[Pose]) -> Pose | None:
-    """The pose of one alone, without the rounding of its angles."""
+    """The pose of a single one, whose angles then are not rounded; None of several."""
     return poses[0] if len(poses) == 1 else None
 
 
@@ -322,11 +335,12 @@ def _pose(rows: Rows, k: int) -> Pose:
 def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Tensor]]) -> Lens:
     """The lens with errors, or with changes of compensators, of operands of configurations."""
     for row, value in pairs:
+        assert row.operand is not None
         operand = lens.operands[row.operand]
         if value.dim() and any(isinstance(scaled.path[-1], tuple) for scaled in operand.paths):
-            raise BadTolerance(f"{_named(row)}: a coefficient that differs between configurations; expected one lens")
+            raise BadTolerance(f"{row}: a coefficient that differs between configurations; expected one lens")
         lens = dataclasses.replace(
-            lens, operands=tuple(_raised(one, row, value) if one is operand else one for one in lens.operands)
+            lens, operands=tuple(_raised(old, row, value) if old is operand else old for old in lens.operands)
         )
         if row.configuration == lens.current_configuration:
             for path, factor, _ in operand.paths:
@@ -336,6 +350,7 @@ def with_operands(lens: Lens, pairs: Sequence[tuple[Tolerance | Compensator, Ten
 
 def _raised(operand: configurations.Operand, row: Tolerance | Compensator, value: Tensor) -> configurations.Operand:
     k = row.configuration - 1
+    assert operand.numbers is not None  # the lens is checked
     numbers = configurations.with_entry(operand.numbers, (k,), operand.numbers[k] + value)
     return dataclasses.replace(operand, numbers=numbers)
 
@@ -349,23 +364,23 @@ def _operands(lens: Lens, numbers: tuple[Surface, ...], moved: Sequence[tuple[in
     def differs(path: configurations.Path) -> bool:
         if path[0] != "surfaces":
             return False
-        posed = path[2] in ("before", "after")
-        return any(a <= path[1] <= b if posed else path[2] == "thickness" and a <= path[1] < b for a, b in moved)
+        k, posed = cast(int, path[1]), path[2] in ("before", "after")
+        return any(a <= k <= b if posed else path[2] == "thickness" and a <= k < b for a, b in moved)
 
     if any(differs(scaled.path) for operand in lens.operands for scaled in operand.paths):
         return ()
-    changed, found = dataclasses.replace(lens, surfaces=numbers), []
+    changed, operands = dataclasses.replace(lens, surfaces=numbers), []
     for operand in lens.operands:
-        path = operand.paths[0].path if operand.paths and operand.numbers is not None else None
-        old, new = (None, None) if path is None else (configurations.part(one, path) for one in (lens, changed))
-        if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old and not isinstance(path[-1], tuple):
-            step = (new - old) / operand.paths[0].factor
-            operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
-        found.append(operand)
-    return tuple(found)
+        if operand.paths and operand.numbers is not None and not isinstance(operand.paths[0].path[-1], tuple):
+            old, new = (configurations.part(view, operand.paths[0].path) for view in (lens, changed))
+            if isinstance(new, Tensor) and isinstance(old, Tensor) and new is not old:
+                step = (new - old) / operand.paths[0].factor
+                operand = dataclasses.replace(operand, numbers=configurations.spread_for(operand.numbers, step) + step)
+        operands.append(operand)
+    return tuple(operands)
 
 
-# -- what a lens does not have ----------------------------------------------------------------------------------------
+# -- checks ----------------------------------------------------------------------------------------
 
 
 def _named(row: Tolerance) -> str:
@@ -374,7 +389,8 @@ def _named(row: Tolerance) -> str:
 
 def check_tolerances(lens: Lens, rows: Iterable[Tolerance]) -> None:
     """Refuse tolerances that a lens does not have. Raises BadTolerance naming what was found and expected."""
-    last, ranges = len(lens.surfaces) - 1, {}
+    last = len(lens.surfaces) - 1
+    ranges: dict[tuple[int, int], Tolerance] = {}
     solves = _solves(lens)
     for row in rows:
         if row.kind not in KINDS:
@@ -421,8 +437,8 @@ def _check_nested(row: Tolerance, ranges: dict[tuple[int, int], Tolerance]) -> N
         if first == b or a == end:
             shared, group = (b if first == b else a), (min(a, first), max(b, end))
             message = f"its element shares the cemented surface {shared} with {a}-{b} ({other.kind}), and would move it"
-            own = (shared + 1, end) if first == b else (shared + 1, b)
-            fix = f"tolerance the cemented group {group}, or the surfaces {own} of the element behind it alone"
+            element = (shared + 1, end) if first == b else (shared + 1, b)
+            fix = f"tolerance the cemented group {group}, or the surfaces {element} of the element behind it alone"
             raise BadTolerance(f"{_named(row)}: {message} twice; {fix}")
         message = f"it shares a part of surfaces {a}-{b} ({other.kind}); expected one inside the other, or apart"
         raise BadTolerance(f"{_named(row)}: {message}")
@@ -453,7 +469,7 @@ def _check_surface(lens: Lens, row: Tolerance, solves: dict[tuple[int, str], Sol
 
 
 def _objection(lens: Lens, row: Tolerance, surface: Surface) -> str:
-    """What the values of a lens forbid, in words, else ""."""
+    """The reason why the values of a lens do not allow a tolerance, "" where they do."""
     if row.kind == "radius" and (surface.curvature is None or not bool((surface.curvature != 0).any())):
         return "the surface is a plane, whose radius has no error; expected power (fringes) or curvature"
     if row.kind in ("index", "abbe") and (surface.is_mirror or is_air(surface.glass)):

@@ -21,10 +21,12 @@ from scipy.special import chdtr, ndtr, ndtri
 from torch import Tensor
 
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.tolerances import Tolerances, check_limits, groups_of, rows_of
+from raytrace.tolerancing.table import ToleranceTable, check_limits, groups_of, rows_of
 
 
-def draw_errors(tolerances: Tolerances | Iterable[Tolerance], count: int, seed: int = 0, *, first: int = 0) -> Tensor:
+def draw_errors(
+    tolerances: ToleranceTable | Iterable[Tolerance], count: int, seed: int = 0, *, first: int = 0
+) -> Tensor:
     """Random errors (count, N) in the rows' units, float64: the trials `first`, `first` + 1, … of a seed.
 
     A trial depends on the seed, its own number and the place of each row alone: trials 0 to 9 and 10 to 19 are those of

@@ -16,6 +16,8 @@ rest:
 Source of the expansion: Rimmer, Appl. Opt. 9, 533 (1970).
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -66,7 +68,9 @@ class SecondOrder:
                 pull[:, k] = torch.clamp(wanted, self.least[k], self.most[k]) - best[:, k]
         return pull
 
-    def means(self, errors: Tensor, mean: Tensor, variance: Tensor, value) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def means(
+        self, errors: Tensor, mean: Tensor, variance: Tensor, value: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """f (K,) of draws (K, N), the means () of f and of q, and the share () of draws whose q is below 0, as none is.
 
         value: f of q; mean, variance: (N,) of the errors.

@@ -1,14 +1,14 @@
 """Study: a criterion of a lens as a function of errors and compensators, its best compensators, and its second order.
 
-The criterion of a lens with errors e and compensators c is a function f(q), the root of a mean square q or what is
-missing of the MTF; the lens as built has the compensators that minimise q. Of one trial they come from Newton's method
-with the exact gradient and differences of gradients, all lenses of a batch at once.
+The criterion of a lens with errors e and compensators c is a function f(q): of a mean square q its root, of
+q = 1 - MTF the MTF. The lens as built has the compensators that minimise q. Newton's method finds them with the exact
+gradient and differences of gradients, for all lenses of a batch at once.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from scipy.special import ndtr
@@ -18,25 +18,29 @@ from raytrace.analysis.setting import scene_of
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
 from raytrace.system import configurations
 from raytrace.system.lens import Lens, aligned, field_points, is_round_about_axis, per_lens
-from raytrace.system.parameter_paths import modelled, number_at, parameter_paths, sensor, with_number
+from raytrace.system.parameter_paths import modelled, parameter_paths, sensor
 from raytrace.system.surface import Surface
 from raytrace.system.tolerance_data import Compensator, Tolerance
 from raytrace.tolerancing.criteria import CRITERIA, Criterion, Sampling, at_best_focus, light, size_of_image
-from raytrace.tolerancing.perturbation import Perturbation, path_of, with_operands
+from raytrace.tolerancing.perturbation import Perturbation, path_of, raised, with_operands
 from raytrace.tolerancing.sampling import density_moments
 from raytrace.tolerancing.second_order import SecondOrder
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.clear_pupil import arms_of, is_clipped
 
 _STEP = 0.05  # of the half width of a tolerance: step of the differences of gradients
 _NEWTON = 12  # steps of the compensators, at most
 _SETTLED = 1e-11  # of q: the gain of the next step at which they end
 _REACH, _NO_EFFECT = 1e3, 1e-9  # a compensator without effect: moved by so many steps it changes q by less, relatively
-_ALIKE = 1e-10  # of the curvatures, each by itself 1: the least one of compensators that differ
+_ALIKE = 1e-10  # smallest eigenvalue of the curvature matrix, scaled to a diagonal of 1, of compensators that differ
 _RINGS, _SAME = (4, 6, 8), 1e-4  # rings of the pupil that are tried, and the accepted relative error of q
 _CLIPPED = (4, 16), (6, 24), (8, 32), (8, 64), (12, 96)  # rings and arms where apertures clip beams; the last are exact
 #: Lenses traced at once.
 CHUNK = 1024
+
+
+#: Fields, as of `field_points`.
+FieldPoints: TypeAlias = Tensor | Sequence | None
 
 
 class View(NamedTuple):
@@ -55,30 +59,34 @@ class Study:
     in any of them, that a lens may lose; one that loses more has no criterion, q is nan.
     """
 
-    def __init__(self, views: Sequence[View], tolerances: Tolerances, loss: float):
+    def __init__(self, views: Sequence[View], tolerances: ToleranceTable, loss: float):
         self.views, self.tolerances, self.loss = views, tolerances, loss
         self.lens, self.criterion, self.sampling, _ = views[0]
         self.perturbations = [Perturbation(view.lens, tolerances) for view in views]
         self.compensators = tolerances.compensators
-        for one in self.compensators:
-            _check(self.lens, one)
+        for compensator in self.compensators:
+            _check(self.lens, compensator)
         like = self.lens.wavelengths
         self.weights = like.new_tensor([[view.weight] for view in views])
-        self.least = like.new_tensor([one.minimum for one in self.compensators])
-        self.most = like.new_tensor([one.maximum for one in self.compensators])
+        self.least = like.new_tensor([compensator.minimum for compensator in self.compensators])
+        self.most = like.new_tensor([compensator.maximum for compensator in self.compensators])
         self.half = (0.5 * (tolerances.maximum - tolerances.minimum)).to(like)
         self.unsettled = 0  # lenses whose compensators still gained 1e-6 of q in the last step
         with torch.no_grad():
             zero = self.half.new_zeros(1, len(self.half))
             self.nominal_light = self._of_views(light, zero, zero.new_zeros(1, len(self.compensators)))
 
-    def _of_views(self, judge: Callable[[Lens, Sampling], Tensor], errors: Tensor, changes: Tensor) -> Tensor:
-        """A number (V, L) of every configuration of lenses with errors (L, N) and compensators moved by (L, C)."""
-        found = []
+    def _of_views(self, judge: Callable[[Lens, Sampling], Tensor] | None, errors: Tensor, changes: Tensor) -> Tensor:
+        """A number (V, L) of every configuration of lenses with errors (L, N) and compensators moved by (L, C).
+
+        judge: the number, by default the quantity of the criterion.
+        """
+        values = []
         for view, perturbation in zip(self.views, self.perturbations, strict=True):
             lens = aligned(with_changes(perturbation(errors), self.compensators, changes), 3)
-            found.append((judge or view.criterion.quantity)(lens, view.sampling).expand(len(errors)))
-        return torch.stack(found)
+            number = view.criterion.quantity if judge is None else judge
+            values.append(number(lens, view.sampling).expand(len(errors)))
+        return torch.stack(values)
 
     def quantity(self, errors: Tensor, changes: Tensor) -> Tensor:
         """q (L,) of lenses with errors (L, N) and compensators moved by (L, C)."""
@@ -114,10 +122,11 @@ class Study:
                 q = self.quantity(e, c)
                 asked = [x for x in (e, c) if x.requires_grad]
                 unused = [None] * len(asked)
-                found = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
-            slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(found, asked, strict=True)]
+                gradients = torch.autograd.grad(q.sum(), asked, allow_unused=True) if q.requires_grad else unused
+            slopes = [torch.zeros_like(x) if g is None else g for g, x in zip(gradients, asked, strict=True)]
             rows.append((q.detach(), slopes[0] if by_errors else torch.zeros_like(e), slopes[-1]))
-        return tuple(torch.cat(part) for part in zip(*rows, strict=True))
+        q, by_e, by_c = map(torch.cat, zip(*rows, strict=True))
+        return q, by_e, by_c
 
     def compensated(self, errors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """q (L,) with the compensators that minimise it, their changes (L, C), and the share of the nominal light (L,).
@@ -132,21 +141,22 @@ class Study:
                 changes = changes.nan_to_num(0.0)  # of a lens with a field without light
                 kept = self.light(some, changes)
                 parts.append((torch.where(1 - kept > self.loss, torch.nan, q), changes, kept))
-        return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+        q, changes, kept = map(torch.cat, zip(*parts, strict=True))
+        return q, changes, kept
 
     def _compensated(self, errors: Tensor) -> tuple[Tensor, Tensor]:
-        at = errors.new_zeros(len(errors), len(self.compensators))
+        changes = errors.new_zeros(len(errors), len(self.compensators))
         if not self.compensators:
             parts = errors.split(self.criterion.together)
-            return torch.cat([self.quantity(part, at[: len(part)]) for part in parts]), at
+            return torch.cat([self.quantity(part, changes[: len(part)]) for part in parts]), changes
         if (refocused := self.refocused(errors)) is not None:
             return refocused
-        curvature, trial, count = self.nominal_curvature(), at, len(errors)
-        q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(at), torch.zeros(count).to(errors)
+        curvature, trial, count = self.nominal_curvature(), changes, len(errors)
+        q, slopes, gain = errors.new_full((count,), torch.inf), torch.zeros_like(changes), torch.zeros(count).to(errors)
         scale, least, moving = errors.new_ones(count, 1), 1e-6 * self.criterion.scale, torch.arange(count)
         for step in range(_NEWTON + 1):
             q_trial, _, slopes_trial = self._slopes(errors[moving], trial, by_errors=False)
-            better, start, before = ~(q_trial > q[moving]), at[moving], slopes[moving]
+            better, start, before = ~(q_trial > q[moving]), changes[moving], slopes[moving]
             if step:
                 moved = trial - start
                 expected = ((moved @ curvature) * moved).sum(-1)
@@ -154,7 +164,7 @@ class Study:
                 secant = torch.where((expected > 0) & (ratio > 0), ratio, 1.0).clamp(0.2, 25.0)
                 scale[moving] = torch.where(better, secant, torch.maximum(secant, 4 * scale[moving, 0]))[:, None]
             q[moving] = torch.where(better, q_trial, q[moving])
-            at[moving] = start = torch.where(better[:, None], trial, start)
+            changes[moving] = start = torch.where(better[:, None], trial, start)
             slopes[moving] = before = torch.where(better[:, None], slopes_trial, before)
             full = torch.linalg.solve(curvature, before[..., None])[..., 0] * self.acting
             trial = torch.clamp(start - full / scale[moving], self.least, self.most)
@@ -164,14 +174,14 @@ class Study:
             if not len(moving):
                 break
         self.unsettled += int((gain > 1e-6 * (q + least)).sum())
-        return q, at
+        return q, changes
 
     def harm(self, errors: Tensor) -> tuple[Tensor, Tensor]:
         """How much worse the criterion (L,) of compensated lenses is than that of the nominal one; their light (L,)."""
         zero = self.half.new_zeros(1, errors.shape[1])
         q, _, light = self.compensated(torch.cat([zero, errors.to(self.half)]))
-        found = self.criterion.value(q)
-        return self.criterion.sign * (found[1:] - found[0]), light[1:]
+        values = self.criterion.value(q)
+        return self.criterion.sign * (values[1:] - values[0]), light[1:]
 
     def nominal_curvature(self) -> Tensor:
         """q_cc (C, C) of the nominal lens, by differences of gradients."""
@@ -181,11 +191,11 @@ class Study:
             steps = self.scale_of_compensators()
             moved = torch.cat([torch.diag(steps), -torch.diag(steps)])
             q, _, slopes = self._slopes(zero, moved, by_errors=False)
-            found = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
-            found = 0.5 * (found + found.T)
-            self.acting = self._acting(torch.diagonal(found), q)
+            hessian = (slopes[:count] - slopes[count:]) / (2 * steps[:, None])
+            hessian = 0.5 * (hessian + hessian.T)
+            self.acting = self._acting(torch.diagonal(hessian), q)
             both = self.acting[:, None] & self.acting
-            self._curvature = torch.where(both, found, torch.eye(count).to(found))
+            self._curvature = torch.where(both, hessian, torch.eye(count).to(hessian))
             root = torch.diagonal(self._curvature).sqrt()
             if float(torch.linalg.eigvalsh(self._curvature / (root[:, None] * root))[0]) < _ALIKE:
                 listed = "; ".join(map(str, self.compensators))
@@ -195,24 +205,28 @@ class Study:
     def _acting(self, curvatures: Tensor, q: Tensor) -> Tensor:
         """Which compensators (C,) act on q; those without effect are refused, unless the criterion allows them.
 
-        Refused are also those that the nominal lens is no minimum of.
+        Compensators by which q of the nominal lens has no minimum are refused as well.
         """
         effect = 0.5 * curvatures * (_REACH * self.scale_of_compensators()) ** 2
         least, name = _NO_EFFECT * (float(q.min()) + self.criterion.scale), self.criterion.name
-        for one, gain in zip(self.compensators, effect.tolist(), strict=True):
+        for compensator, gain in zip(self.compensators, effect.tolist(), strict=True):
             if abs(gain) <= least and not self.criterion.allows_idle:
-                what = f"it does not improve the criterion: it has no effect on the {name}"
-                raise BadTolerance(f"compensator {one}: {what}; leave it out")
+                reason = f"it does not improve the criterion: it has no effect on the {name}"
+                raise BadTolerance(f"compensator {compensator}: {reason}; leave it out")
             if gain < -least:
-                what = f"the {name} has no optimum near the nominal lens"
-                raise BadTolerance(f"compensator {one}: {what}; focus the lens first (rt.focus), or optimise it")
+                reason = f"the {name} has no optimum near the nominal lens"
+                raise BadTolerance(
+                    f"compensator {compensator}: {reason}; focus the lens first (rt.focus), or optimise it"
+                )
         return effect.abs() > least
 
     def scale_of_compensators(self) -> Tensor:
         """Steps (C,) of the differences by the compensators."""
         names = [
-            one.parameter if one.operand is None else self.lens.operands[one.operand].paths[0].path[-1]
-            for one in self.compensators
+            compensator.parameter
+            if compensator.operand is None
+            else self.lens.operands[compensator.operand].paths[0].path[-1]
+            for compensator in self.compensators
         ]
         return self.half.new_tensor([1e-3 if name == "thickness" else 1e-6 for name in names])
 
@@ -235,16 +249,16 @@ class Study:
         mixed, curvature = whole[:count, acting], whole[acting][:, acting]
         response = -torch.linalg.solve(curvature, mixed.T).T
         start = -torch.linalg.solve(curvature, slope[acting])
-        limits = ((limit - best[0])[acting - count] for limit in (self.least, self.most))
+        least, most = ((limit - best[0])[acting - count] for limit in (self.least, self.most))
         return SecondOrder(
             q[-1] + 0.5 * start @ slope[acting], slope[:count] + mixed @ start,
-            whole[:count, :count] + mixed @ response.T, start, response, curvature, *limits,
+            whole[:count, :count] + mixed @ response.T, start, response, curvature, least, most,
         )  # fmt: skip
 
 
 def focuses(lens: Lens, compensators: Sequence[Compensator]) -> bool:
-    """Whether the distance of the sensor is all that is adjusted, and the beams do not depend on it."""
-    adjusted = [(one.surface, one.parameter, one.operand) for one in compensators]
+    """Whether the sensor distance is the only compensator, and the beams do not depend on it."""
+    adjusted = [(compensator.surface, compensator.parameter, compensator.operand) for compensator in compensators]
     of_sensor = adjusted == [(sensor(lens), "thickness", None)]
     return of_sensor and lens.fields.kind != "real_image_height"
 
@@ -259,28 +273,27 @@ def with_changes(lens: Lens, compensators: Sequence[Compensator], changes: Tenso
     pairs = [*zip(compensators, map(per_lens, changes.unbind(-1)), strict=True)]
     lens = with_operands(lens, [pair for pair in pairs if pair[0].operand is not None])
     surfaces = list(lens.surfaces)
-    for one, change in (pair for pair in pairs if pair[0].operand is None):
-        surface = modelled(surfaces[one.surface], one.parameter)
-        path = path_of(surface, one.parameter)
-        surfaces[one.surface] = with_number(surface, path, number_at(surface, path) + change)
+    for compensator, change in (pair for pair in pairs if pair[0].operand is None):
+        surface = modelled(surfaces[compensator.surface], compensator.parameter)
+        surfaces[compensator.surface] = raised(surface, compensator.parameter, change)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
-def _check(lens: Lens, one: Compensator) -> None:
-    if one.operand is not None:
+def _check(lens: Lens, compensator: Compensator) -> None:
+    if compensator.operand is not None:
         count = configurations.count(lens.operands)
-        if not 0 <= one.operand < len(lens.operands) or not 1 <= one.configuration <= count:
+        if not 0 <= compensator.operand < len(lens.operands) or not 1 <= compensator.configuration <= count:
             known = f"{len(lens.operands)} operands in configurations 1 to {count}"
-            raise BadTolerance(f"compensator {one}: this lens has {known}")
-        if lens.operands[one.operand].numbers is None:
-            raise BadTolerance(f"compensator {one}: {lens.operands[one.operand]} is no number")
+            raise BadTolerance(f"compensator {compensator}: this lens has {known}")
+        if lens.operands[compensator.operand].numbers is None:
+            raise BadTolerance(f"compensator {compensator}: {lens.operands[compensator.operand]} is no number")
         return
-    if not 0 <= one.surface < len(lens.surfaces) - 1:
-        raise BadTolerance(f"compensator {one}: this lens has surfaces 0 to {len(lens.surfaces) - 2}")
-    surface = lens.surfaces[one.surface]
-    if path_of(surface, one.parameter) is None:
-        known = ", ".join(["thickness", *parameter_paths(modelled(surface, one.parameter))])
-        raise BadTolerance(f"compensator {one}: the surface does not have it; expected {known}")
+    if not 0 <= compensator.surface < len(lens.surfaces) - 1:
+        raise BadTolerance(f"compensator {compensator}: this lens has surfaces 0 to {len(lens.surfaces) - 2}")
+    surface = lens.surfaces[compensator.surface]
+    if path_of(surface, compensator.parameter) is None:
+        known = ", ".join(["thickness", *parameter_paths(modelled(surface, compensator.parameter))])
+        raise BadTolerance(f"compensator {compensator}: the surface does not have it; expected {known}")
 
 
 def moments(row: Tolerance) -> tuple[float, float]:
@@ -302,18 +315,22 @@ def _moments(row: Tolerance) -> tuple[float, float]:
 
 
 def views_of(
-    lens: Lens, criterion: Callable[[Lens, Sampling], Criterion], fields, rings: int | None, arms: int | None
+    lens: Lens,
+    criterion: Callable[[Lens, Sampling], Criterion],
+    fields: FieldPoints,
+    rings: int | None,
+    arms: int | None,
 ) -> list[View]:
     """The configurations of a lens that have a weight with their criteria, made of each and of its sampling."""
-    found, weights = [], configurations.weights(lens.operands)
+    views, weights = [], configurations.weights(lens.operands)
     for each, weight in zip(lens.configurations if len(weights) > 1 else [lens], weights, strict=True):
         if weight > 0:
             sampling = sampling_of(each, fields, rings, arms)
-            found.append(View(each, criterion(each, sampling), sampling, weight))
-    return found
+            views.append(View(each, criterion(each, sampling), sampling, weight))
+    return views
 
 
-def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | None = None) -> Sampling:
+def sampling_of(lens: Lens, fields: FieldPoints = None, rings: int | None = None, arms: int | None = None) -> Sampling:
     """Fields and pupil points of a lens and of lenses near it.
 
     fields: by default those of the lens with their weights; as errors are not symmetric, a lens that is round about its
@@ -321,7 +338,6 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
     pupil (`tracing.clear_pupil`) of each lens near a nominal one that clips rays; by default the fewest that give the
     mean square spot radius of `spot` to _SAME, and where rays are clipped the wavefront's variance, too.
     """
-    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = field_points(fields, like=lens)
     weights = lens.fields.weight if fields is None else torch.ones_like(points[0])
     if fields is None and is_round_about_axis(lens):
@@ -334,12 +350,16 @@ def sampling_of(lens: Lens, fields=None, rings: int | None = None, arms: int | N
 
     finest = SAMPLINGS["gauss"][2]
     view = scene_of(lens, points)
-    clips = is_clipped(view, gauss_rings(finest if rings is None else rings, arms, **like)[0])
+
+    def gauss(rings: int, arms: int | None) -> tuple[Tensor, Tensor]:
+        return gauss_rings(rings, arms, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+
+    clips = is_clipped(view, gauss(finest if rings is None else rings, arms)[0])
 
     def rule(rings: int, arms: int | None) -> Sampling:
         clear = arms_of(view, arms or 4 * rings) if clips else None
-        at, shares = clear.rule(rings) if clips else gauss_rings(rings, arms, **like)
-        return Sampling(points, weights, at, shares, rings, clear)
+        pupil, shares = gauss(rings, arms) if clear is None else clear.rule(rings)
+        return Sampling(points, weights, pupil, shares, rings, clear)
 
     with torch.no_grad():
         if rings is not None:

@@ -43,7 +43,7 @@ def aim_at_stop(
     wavelength: Tensor,
     radius: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Entrance pupil points (2, ...) whose rays pass the stop at turned(pupil) times `radius`; and whether found (...).
+    """Entrance pupil points (2, ...) whose rays pass the stop at turned(pupil) times `radius`; whether they pass (...).
 
     pupil: (2, ...), initial points too; radius: mm, negative where the entrance pupil is an inverted image of the stop;
     through(pupil, fraction): rays of a fraction of the field.
@@ -54,23 +54,23 @@ def aim_at_stop(
 
     def missed(aim: Tensor, fraction: float, target: Tensor = target) -> tuple[Tensor, Tensor]:
         (position,), arrives = on_stop(through(aim, fraction))
-        return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
+        return torch.stack([hit / radius - to for hit, to in zip(position, target, strict=True)]), arrives
 
     def near() -> tuple[Tensor, Tensor]:
         """Roots (2, ...), and columns (2, 2, ...) of inverse Jacobians, as Zernike series through those of few rays."""
-        at = pupil.detach()
-        shared = at[(slice(None), *[slice(1)] * (at.dim() - 2))]
-        at = shared if torch.equal(shared.expand_as(at), at) else at
-        low, high = at.amin(-1, keepdim=True), at.amax(-1, keepdim=True)
+        fractions = pupil.detach()
+        shared = fractions[(slice(None), *[slice(1)] * (fractions.dim() - 2))]
+        fractions = shared if torch.equal(shared.expand_as(fractions), fractions) else fractions
+        low, high = fractions.amin(-1, keepdim=True), fractions.amax(-1, keepdim=True)
         low = torch.stack([torch.where(low[0] >= 0, -high[0], low[0]), low[1]])  # half a pupil represents all of it
         centre, half = 0.5 * (low + high), 0.5 * (high - low)
-        disc = safe_divide(at - centre, half)
+        disc = safe_divide(fractions - centre, half)
         size = _length(disc).amax(-1, keepdim=True)
-        points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, dtype=at.dtype, device=at.device)
-        few = centre + half * size * with_batch_axes(points, at.dim() - 1)
+        points, weights = gauss_rings(_DEGREE // 2 + 2, 2 * _DEGREE + 4, dtype=size.dtype, device=size.device)
+        few = centre + half * size * with_batch_axes(points, fractions.dim() - 1)
         aim, _ = aim_at_stop(lens, through, few, turned, wavelength, radius)
         rows = _error_and_jacobian(partial(missed, target=turned(few)), aim, 1.0)[1]
-        inverse = [_solve(rows, unit) for unit in ((1.0, 0.0), (0.0, 1.0))]
+        inverse = [_solve(rows, unit) for unit in rows[0].new_tensor([[1.0, 0.0], [0.0, 1.0]])]
         orders = [zernike.noll(j) for j in range(1, (_DEGREE + 1) * (_DEGREE + 2) // 2 + 1)]
         series = (torch.stack([aim.detach(), *inverse]) * weights) @ zernike.polynomials(orders, *points).T
         basis = zernike.polynomials(orders, *safe_divide(disc, size.expand_as(disc)))
@@ -81,14 +81,14 @@ def aim_at_stop(
     given = lens, first, target, radius, wavelength
     batch = broadcast_shape(pupil.shape[1:], first.shape, wavelength.shape, batch_shape(lens))
     start = with_batch_axes(pupil.detach(), len(batch)).expand(2, *batch)
-    aim, found = _root(missed, start, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
-    return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
+    aim, is_root = _root(missed, start, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
+    return torch.stack([torch.where(is_root, at_root, to) for at_root, to in zip(aim, pupil, strict=True)]), is_root
 
 
 def aim_at_middle(
     lens: Lens, through: Callable[[Tensor], Rays], start: Tensor, wavelength: Tensor, size: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Points (2, ...) whose rays pass the centre of the stop, else the start; and whether found (...).
+    """Points (2, ...) whose rays pass the centre of the stop, else the start; and whether they pass it (...).
 
     through(points): rays; size: () mm, the scale of the residual. Second derivatives are exact too.
     """
@@ -99,17 +99,17 @@ def aim_at_middle(
         (position,), arrives = on_stop(through(point))
         return position / size, arrives
 
-    root, found = _root(missed, start, origin=lambda start: start, given=(lens, through(start.detach()), size))
+    root, is_root = _root(missed, start, origin=lambda start: start, given=(lens, through(start.detach()), size))
     root = root - _solve(_error_and_jacobian(missed, root.detach(), 1.0)[1], missed(root, 1.0)[0])
-    return torch.where(found, root, start), found
+    return torch.where(is_root, root, start), is_root
 
 
 def aim_at_image(
     lens: Lens, through: Callable[[Tensor, Tensor], Rays], height: Tensor, estimate: Tensor, radius: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Fields (2, ...) whose chief rays, at the primary wavelength, meet the image at `height`; and whether found (...).
+    """Fields (2, ...) whose primary chief rays meet the image at `height`, and whether they do (...).
 
-    A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), initial field;
+    A field is 0 where they do not. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), initial field;
     radius: of the stop, whose centre the chief ray passes, or None if it passes that of the paraxial entrance pupil.
     """
     wavelength = lens.primary
@@ -120,9 +120,9 @@ def aim_at_image(
     def missed(unknown: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
         pupil = torch.zeros_like(unknown[:2]) if radius is None else unknown[2:]
         (stop, image), arrives = landing(through(unknown[:2], pupil))
-        off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
+        off = [(hit - fraction * to) / size for hit, to in zip(image, height, strict=True)]
         if radius is not None:  # at the stop, chief rays of all heights may share one point
-            off = torch.broadcast_tensors(*off, *(at / radius for at in stop))
+            off = torch.broadcast_tensors(*off, *(hit / radius for hit in stop))
         return torch.stack(off), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
@@ -130,8 +130,8 @@ def aim_at_image(
     given = lens, height, first, radius
     batch = broadcast_shape(first.shape, height.shape[1:], batch_shape(lens))
     start = with_batch_axes(start.detach(), len(batch)).expand(len(start), *batch)
-    unknown, found = _root(missed, start, origin=torch.zeros_like, given=given)
-    return torch.where(found, unknown[:2], 0.0), found
+    unknown, is_root = _root(missed, start, origin=torch.zeros_like, given=given)
+    return torch.where(is_root, unknown[:2], 0.0), is_root
 
 
 def _root(
@@ -142,42 +142,49 @@ def _root(
     given: object,
     near: Callable[[], tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Unknowns (n, ...) where the residuals of the full field vanish, and whether found (...); start: of every root;
-    origin: axial roots; given: all numbers on which the residuals depend.
+    """Unknowns (n, ...) where the residuals of the full field vanish, and whether they do (...).
 
-    near: makes starts (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first.
+    start: of every root; origin: axial roots; given: all numbers on which the residuals depend; near: makes starts
+    (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first.
     """
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
     # Roots not found are evaluated on the axis, where every derivative is finite.
-    root, found = origin(start), torch.zeros_like(start[0], dtype=torch.bool)
+    root, is_root = origin(start), torch.zeros_like(start[0], dtype=torch.bool)
     last_step, close = torch.zeros_like(root), _CLOSE * tolerance
-    searches = [partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES]
+    searches: list[Callable[[], tuple[Tensor, Tensor, Tensor]]] = [
+        partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES
+    ]
     if near is not None and not in_transform():
-        searches.insert(0, lambda: _chords(residual, *near(), close))
+        searches.insert(0, partial(_chords, residual, near, close))
     for search in searches:
         followed, worst, step = search()
-        new = (worst <= tolerance) & ~found
+        new = (worst <= tolerance) & ~is_root
         root, last_step = torch.where(new, followed, root), torch.where(new, step, last_step)
-        found = found | new
-        if not is_any(~found):
+        is_root = is_root | new
+        if not is_any(~is_root):
             break
     root = root - last_step
     if not any(map(varies, pytree.tree_leaves(given))):  # else the last step is attached: first derivatives are exact
-        return root, found
-    return root - _solve(_error_and_jacobian(residual, root, 1.0)[1], residual(root, 1.0)[0]), found
+        return root, is_root
+    return root - _solve(_error_and_jacobian(residual, root, 1.0)[1], residual(root, 1.0)[0]), is_root
 
 
 @torch.no_grad()
-def _chords(residual: Residual, root: Tensor, columns: Tensor, close: float) -> tuple[Tensor, Tensor, Tensor]:
+def _chords(
+    residual: Residual, near: Callable[[], tuple[Tensor, Tensor]], close: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """As `_followed`, at the full field from close starts: steps by the columns of constant inverse Jacobians."""
-    for left in reversed(range(_CHORDS)):
-        error, arrives = residual(root, 1.0)
-        error = error.detach()
-        step = sum(column * part for column, part in zip(columns, error, strict=True))
-        worst = torch.where(arrives, error.abs().amax(0), torch.inf)
-        if not left or not is_any(worst > close):
-            return root, worst, step
+    root, columns = near()
+    step = torch.zeros_like(root)
+    for _ in range(_CHORDS):
         root = root - step
+        error, arrives = residual(root, 1.0)
+        parts = (column * part for column, part in zip(columns, error.detach(), strict=True))
+        step = sum(parts, start=torch.zeros_like(root))
+        worst = torch.where(arrives, error.detach().abs().amax(0), torch.inf)
+        if not is_any(worst > close):
+            break
+    return root, worst, step
 
 
 def _followed(
@@ -241,8 +248,8 @@ def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[T
     """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph."""
     # `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
     if in_transform():
-        value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
-        return value.detach(), lambda v: pull(v)[0].detach(), arrives
+        value, pull_all, arrives = torch.func.vjp(function, point, has_aux=True)  # type: ignore[misc]  # two of three
+        return value.detach(), lambda v: pull_all(v)[0].detach(), arrives
     with torch.enable_grad(), values_alone():
         point = point.detach().requires_grad_()
         value, arrives = function(point)

@@ -53,7 +53,7 @@ class BaseRay:
     exit_pupil_position: from the image surface to that in image space; diameters > 0.
     paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
     magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
-    A quantity that does not exist (the focal length of an afocal lens, say) is infinite.
+    A quantity that does not exist, such as the focal length of an afocal lens, is infinite.
     """
 
     valid: Tensor
@@ -95,9 +95,9 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     """
     wavelength = lens.primary if wavelength is None else wavelength
     near = _near(lens, wavelength)
-    one, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
-    parallel = near.behind(one, 0 * one)
-    fan = near.behind(one, kappa * one)
+    moves, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
+    parallel = near.behind(moves, 0 * moves)
+    fan = near.behind(moves, kappa * moves)
     # Through the middle of the stop, A m + B t = 0, also where A = 0, as chief rays are parallel in object space: of
     # object points 1 mm off the base ray, over κ.
     through = _inverse(near.A + kappa * near.B)
@@ -123,7 +123,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
         exit_pupil_position=_first(exit_pupil),
         exit_pupil_diameter=_first(2 * _length(across)),
         image_distance=_first(image + near.last[..., None]),
-        paraxial_working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
+        paraxial_working_f_number=_first(_over(0.5, near.n_image[..., None] * _length(rim[1]))),
         magnification=_first(magnification),
     )
 
@@ -151,7 +151,7 @@ class _Near(NamedTuple):
     and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm, launched: (3, ...)
     of the base ray in the plane of the vertex of surface 1; position, direction: (3, ...) and valid: (...) on the
     image; last: (...) mm to it from the last real surface; carried: (..., 3, 2) the local y and x of the start behind
-    mirrors and turned axes; vergence: (...) 1/mm of the object from that plane; radius: (...) mm of the stop; index:
+    mirrors and turned axes; vergence: (...) 1/mm of the object from that plane; radius: (...) mm of the stop; n_image:
     (...) n′.
     """
 
@@ -171,11 +171,12 @@ class _Near(NamedTuple):
     carried: Tensor
     vergence: Tensor
     radius: Tensor
-    index: Tensor
+    n_image: Tensor
 
     def behind(self, move: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
         """X and D (..., 3, k) of k rays that are moved and turned at the start, (..., 2, k) each."""
-        return tuple(m[..., :2] @ move + m[..., 2:] @ turn for m in (self.X, self.D))
+        X, D = (m[..., :2] @ move + m[..., 2:] @ turn for m in (self.X, self.D))
+        return X, D
 
 
 @shared
@@ -187,7 +188,7 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     axes, image = _axes(launched), len(lens.surfaces) - 1
     real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
 
-    def traced(change: Tensor):
+    def traced(change: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         t, s, turn_t, turn_s = change
         up, right = (axis[:, None] for axis in axes)
         position = torch.stack([*aim, torch.zeros_like(aim[0])])[:, None]
@@ -217,7 +218,7 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
         carried=_carried(lens, launched, axes, ways),
         vergence=vergence,
         radius=_stop_radius(lens, H_inverse, _over(A, vergence[..., None, None])[..., 0] + B[..., 0]),
-        index=indices[-1],
+        n_image=indices[-1],
     )  # fmt: skip
 
 
@@ -253,21 +254,23 @@ def _axes(launched: Tensor) -> tuple[Tensor, Tensor]:
     return up, torch.linalg.cross(up, launched, dim=0)
 
 
-def _linearised(function: Callable, at: Tensor, given: object) -> tuple[Tensor, Tensor, tuple]:
+def _linearised(
+    function: Callable[[Tensor], tuple[Tensor, tuple[Tensor, ...]]], point: Tensor, given: object
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     """f (m, ...) at a point (n, ...), its Jacobian (m, n, ...), and f's second result; given: numbers f depends on."""
     # One backward pass of m copies: in forward mode, tangents of plain numbers cost four times as much as the trace.
 
     def units(count: int) -> Tensor:
-        ones = torch.eye(count, dtype=at.dtype, device=at.device)
-        return ones.reshape(count, count, *(1,) * (at.dim() - 1)).expand(count, count, *at.shape[1:])
+        ones = torch.eye(count, dtype=point.dtype, device=point.device)
+        return ones.reshape(count, count, *(1,) * (point.dim() - 1)).expand(count, count, *point.shape[1:])
 
     if in_transform() or in_forward_mode():
-        change = units(len(at))
-        figures, slopes, others = torch.func.jvp(function, (at[:, None] + 0 * change,), (change,), has_aux=True)
+        change, start = units(len(point)), point[:, None]
+        figures, slopes, others = torch.func.jvp(function, (start + 0 * change,), (change,), has_aux=True)  # type: ignore[misc]  # two of three
         return figures[:, 0], slopes, others
     recorded = torch.is_grad_enabled() and any(map(varies, pytree.tree_leaves(given)))
     with torch.enable_grad():
-        copies = at[:, None].repeat(1, _FIGURES, *(1,) * (at.dim() - 1)).requires_grad_()
+        copies = point[:, None].repeat(1, _FIGURES, *(1,) * (point.dim() - 1)).requires_grad_()
         figures, others = function(copies)
         # Of a scalar: with weights `grad` imports sympy, 1.4 s.
         (slopes,) = torch.autograd.grad((figures * units(_FIGURES)).sum(), copies, create_graph=recorded)
@@ -326,7 +329,7 @@ def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
 
 
 def _inverse(m: Tensor) -> Tensor:
-    """Inverse of matrices (..., 2, 2); infinite where there is none."""
+    """Inverse of matrices (..., 2, 2); infinite for singular ones."""
     a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
     adjugate = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
     return _over(adjugate, (a * d - b * c)[..., None, None])
@@ -341,7 +344,7 @@ def _polar(m: Tensor) -> tuple[Tensor, Tensor]:
     side = torch.where(a * d - b * c < 0, -1.0, 1.0).to(a.dtype)
     p, q = a + side * d, b - side * c
     size = torch.hypot(p, q)
-    p, q = (torch.where(size > 0, part / torch.where(size > 0, size, 1.0), one) for part, one in ((p, 1.0), (q, 0.0)))
+    p, q = (torch.where(size > 0, part / torch.where(size > 0, size, 1.0), unit) for part, unit in ((p, 1.0), (q, 0.0)))
     Q = torch.stack([torch.stack([p, q], -1), torch.stack([-side * q, side * p], -1)], -2)
     return Q, _inverse(m) @ Q
 
@@ -363,18 +366,18 @@ def _sign(carried: Tensor, vectors: Tensor) -> Tensor:
 
 
 def _length(vectors: Tensor, axis: int = -2) -> Tensor:
-    """Infinite where a vector is not a number, as one of an inverse that does not exist."""
+    """Lengths (...) of vectors; infinite for a vector of nan, as of an inverse that does not exist."""
     square = (vectors * vectors).sum(axis)
     return torch.where(square.isnan(), torch.inf, safe_sqrt(square))
 
 
 def _over(numerator: Tensor | float, denominator: Tensor) -> Tensor:
     """A quotient that is infinite, without a derivative, where the denominator is 0."""
-    there = denominator.abs() > _PARALLEL
-    return torch.where(there, numerator / torch.where(there, denominator, 1.0), torch.inf)
+    finite = denominator.abs() > _PARALLEL
+    return torch.where(finite, numerator / torch.where(finite, denominator, 1.0), torch.inf)
 
 
 def _first(figures: Tensor) -> Tensor:
-    """(2, ...) of (..., 2); infinite what is not a number."""
+    """Figures (..., 2) as (2, ...); nan becomes infinite."""
     figures = torch.movedim(figures, -1, 0)
     return torch.where(torch.isnan(figures), torch.inf, figures)

@@ -32,7 +32,7 @@ from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
 from raytrace.tracing.trace import without_apertures
 
-_SCAN, _COARSER = 32, 8  # steps along an arm in which edges are looked for, and where nothing stands inside the beam
+_SCAN, _COARSER = 32, 8  # steps along an arm in the search for edges, with and without an aperture inside the beam
 _NARROW, _NEAR, _ROUNDS = 2**-11, 1 / 32, 9  # an edge is enclosed in 2⁻¹¹ of its arm: slopes are good to 5e-4
 _NARROWER = 2**-20  # of an arm, where rays miss a surface: no slope leads on to the edge
 _MOST_PARTS = 3  # clear parts of one arm
@@ -53,7 +53,7 @@ class Edges:
 
     radius: (2, D, F, W, B) inner and outer; number: (2, D, F, W, B) of the clearance that is 0 there, as of
     `_clearances_at`: 0 for the edge of the pupil, -1 for the origin; slope: (2, D, F, W, B) of that clearance along the
-    arm, 0 where there is none; exists: (D, F, W, B), whether the arm has this part.
+    arm, 0 at the ends of the arm; exists: (D, F, W, B), whether the arm has this part.
     """
 
     radius: Tensor
@@ -81,7 +81,7 @@ class Arms:
 
     origin: (2, D, F, W) pupil point from which they start, unit: (2, D, F, W, B) their directions, share: (D, F, W, B)
     of the full angle that each represents, 1 in all. inner, outer: (D, F, W, B) radii between which light passes, with
-    derivatives. rays: how many were traced for each kernel. edges, kinks: what `rule_near` starts from.
+    derivatives. rays: how many were traced for each kernel. edges, kinks: the start of `rule_near`.
     """
 
     origin: Tensor
@@ -90,8 +90,8 @@ class Arms:
     inner: Tensor
     outer: Tensor
     rays: int
-    edges: Edges | None = None
-    kinks: Kinks | None = None
+    edges: Edges
+    kinks: Kinks
 
     def rule(self, rings: int) -> tuple[Tensor, Tensor]:
         """Pupil points (2, D, F, W, P) and weights (D, F, W, P): `rings` nodes on each part, those of a ring together.
@@ -187,8 +187,8 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
 
     fold: the symmetry of the light, as of `scene.symmetry`: "mirror": arms in x > 0 alone; "round": a single one.
     They start inside the clear pupil. Where an aperture can stop light in the midst of the beam (an obscuration, a
-    polygon) they start at the centre of the pupil; if it stands beside the centre, the angles are of equal steps, and a
-    second or third clear part of all arms follows the first ones.
+    polygon) they start at the centre of the pupil; if it does not cover the centre, the angles are of equal steps, and
+    a second or third clear part of all arms follows the first ones.
     """
     like = scene.wavelengths
     around = 2 * math.pi if fold == "none" else math.pi
@@ -196,14 +196,15 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
     if fold == "round":
         unit, origin = like.new_tensor([[0.0], [1.0]]).reshape(2, 1, 1, 1, 1), like.new_zeros(2, *scene.shape)
         unit = unit.expand(2, *scene.shape, 1)
-        return _clear_parts(scene, origin, unit, torch.ones_like(unit[0]), *_enclosed(scene, unit, origin))
+        edges, traced = _enclosed(scene, unit, origin)
+        return _clear_parts(scene, origin, unit, torch.ones_like(unit[0]), edges, traced, _no_kinks(edges, 1))
     is_hollow = any(map(stands_inside, apertures))
     with torch.no_grad():
         origin, traced = like.new_zeros(2, *scene.shape), 0
         if not is_hollow:
             points, weights = gauss_rings(*_INNER, dtype=like.dtype, device=like.device)
             passes = torch.where(trace_scene(scene, points).valid, weights, 0.0)
-            origin = torch.stack([safe_divide((passes * at).sum(-1), passes.sum(-1)) for at in points])
+            origin = torch.stack([safe_divide((passes * part).sum(-1), passes.sum(-1)) for part in points])
             origin = torch.stack([torch.zeros_like(origin[0]), origin[1]]) if fold == "mirror" else origin
             traced = points.shape[1]
     kinks, searched = _kinks(scene, origin, count, fold, is_hollow)
@@ -233,11 +234,11 @@ def rule_near(
     others = (~is_near).nonzero()[:, 0]
     for some in others.split(_TOGETHER) if len(others) else ():
         chosen = scene if len(is_near) == 1 else dataclasses.replace(scene, lens=one_lens(scene.lens, some), memo=None)
-        at, shares = arms_of(chosen, count).rule(rings)
-        more = at.shape[-1] - points.shape[-1]
+        searched, shares = arms_of(chosen, count).rule(rings)
+        more = searched.shape[-1] - points.shape[-1]
         points, weights = (torch.nn.functional.pad(t, (0, max(0, more))) for t in (points, weights))
-        at, shares = (torch.nn.functional.pad(t, (0, max(0, -more))) for t in (at, shares))
-        points, weights = points.index_copy(1, some, at), weights.index_copy(0, some, shares)
+        searched, shares = (torch.nn.functional.pad(t, (0, max(0, -more))) for t in (searched, shares))
+        points, weights = points.index_copy(1, some, searched), weights.index_copy(0, some, shares)
     return points, weights
 
 
@@ -303,10 +304,15 @@ def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
     return angles, shares
 
 
+def _no_kinks(edges: Edges, count: int) -> Kinks:
+    none = edges.radius[0, ..., :0]
+    return Kinks(none, none, edges.number[..., :0], count)
+
+
 def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool) -> tuple[Kinks, int]:
     """Where another edge begins to bound the clear pupil, or blocked arms begin, for `count` arms.
 
-    There are none if an arm has several clear parts. And the number of rays traced for each kernel.
+    No kinks if an arm has several clear parts. Also returns the number of rays traced for each kernel.
     """
     is_whole = fold == "none"
     coarse = _COARSE if is_whole else _COARSE // 2
@@ -314,19 +320,19 @@ def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool)
     angle = (torch.arange(coarse, dtype=origin.dtype, device=origin.device) + 0.5) * step
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])[:, None, None, None].expand(2, *scene.shape, -1)
     edges, traced = _enclosed(scene, unit, origin)
-    none = origin.new_zeros(*scene.shape, 0)
-    found = [Kinks(none, none, edges.number.new_zeros(2, *none.shape), count)]
+    kinks = [_no_kinks(edges, count)]
     if edges.exists.shape[-1] > coarse:
-        return found[0], traced
+        return kinks[0], traced
     (inner, outer), (number_in, number_out), exists = edges.radius, edges.number, edges.exists
     exists_after = exists.roll(-1, -1)
     changes = []
     for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
         after = number.roll(-1, -1)
         changes.append((exists & exists_after & (number != after), 0.5 * (radius + radius.roll(-1, -1)), number, after))
-    # The last arm before blocked ones ends where its own two edges meet.
-    last = [torch.where(exists, t, t.roll(-1, -1)) for t in (0.5 * (inner + outer), number_in, number_out)]
-    changes.append(((exists != exists_after) & (last[1] >= 0), *last))
+    # The last arm before blocked ones ends where its two edges meet.
+    ends = (0.5 * (inner + outer), number_in, number_out)
+    radius, number, other = (torch.where(exists, t, t.roll(-1, -1)) for t in ends)
+    changes.append(((exists != exists_after) & (number >= 0), radius, number, other))
     for change, radius, number, other in changes:
         if not is_whole:
             change = torch.cat([change[..., :-1], torch.zeros_like(change[..., :1])], -1)
@@ -338,11 +344,13 @@ def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool)
         start = radius.gather(-1, order), angle[order] + 0.5 * step
         kink, rays = _crossing(scene, origin, start, pair, step)
         traced += rays
-        found.append(Kinks(torch.where(change.gather(-1, order), kink, torch.inf), start[0], pair, count))
-    return Kinks(*(torch.cat(part, -1) for part in zip(*map(pytree.tree_leaves, found), strict=True)), count), traced
+        kinks.append(Kinks(torch.where(change.gather(-1, order), kink, torch.inf), start[0], pair, count))
+    return pytree.tree_map(lambda *parts: torch.cat(parts, -1), *kinks), traced
 
 
-def _crossing(scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float):
+def _crossing(
+    scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float
+) -> tuple[Tensor, int]:
     """Angle (D, F, W, K) where two clearances (2, D, F, W, K) vanish together, near a radius and an angle; and rays."""
     radius, angle = start
     here = origin[..., None] + radius * torch.stack([torch.sin(angle), torch.cos(angle)])
@@ -354,23 +362,24 @@ def _crossing(scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: 
             values = _clearances_at(scene, shifted.flatten(-2)).unflatten(-1, (-1, 3))
             c = values.gather(0, pair[..., None].expand(*pair.shape, 3))  # (2, D, F, W, K, 3)
             differences = c[..., 1:] - c[..., :1]
-            here = here - _newton(*c[..., 0], differences, small).clamp(-step, step)
+            here = here - _newton(c[..., 0], differences, small).clamp(-step, step)
     for _ in range(2):  # with constant slopes, as in `_clear_parts`
-        here = here - _newton(*_clearances_at(scene, here).gather(0, pair), differences, small)
+        here = here - _newton(_clearances_at(scene, here).gather(0, pair), differences, small)
     x, y = here - origin[..., None]
     turned = torch.remainder(torch.atan2(x, y) - angle + math.pi, 2 * math.pi) - math.pi
     return angle + torch.where(turned.abs() <= 0.51 * step, turned, 0.0), (3 * _NEWTON + 2) * radius.shape[-1]
 
 
-def _newton(u: Tensor, v: Tensor, differences: Tensor, small: float) -> Tensor:
-    """Step (2, ...) to the zero of two clearances (...); differences: (2, ..., 2) of theirs over `small` in x and y."""
+def _newton(clearances: Tensor, differences: Tensor, small: float) -> Tensor:
+    """Step (2, ...) to the zero of clearances (2, ...); differences: (2, ..., 2) of theirs over `small` in x and y."""
+    u, v = clearances
     (a, b), (p, q) = (both.unbind(-1) for both in differences)
     determinant = a * q - b * p
     return small * torch.stack([safe_divide(q * u - b * v, determinant), safe_divide(a * v - p * u, determinant)])
 
 
 def _clear_parts(
-    scene: Scene, origin: Tensor, unit: Tensor, share: Tensor, edges: Edges, traced: int, kinks: Kinks | None = None
+    scene: Scene, origin: Tensor, unit: Tensor, share: Tensor, edges: Edges, traced: int, kinks: Kinks
 ) -> Arms:
     """Arms in the directions (2, D, F, W, A) whose parts end at edges that are known closely.
 
@@ -416,11 +425,11 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Edges, int]:
         here = torch.cat([passed & (part == number + 1) for number in range(count)], -1)
         unit, reach, scanned = (torch.cat([t] * count, -1) for t in (unit, reach, scanned))
         first, last = (t.to(torch.int8).argmax(0) for t in (here, here.flip(0)))
-        at = torch.stack([first, steps - last]), torch.stack([first - 1, steps - last + 1])
-        ends = torch.stack([at[1][0] < 0, at[1][1] > steps])  # at the origin, at the edge of the pupil
-        at = [place.clamp(0, steps) for place in at]
-        passes, blocked = (step[place] * reach for place in at)
-        inside, outside = (scanned.gather(1, place.expand(len(scanned), *place.shape)) for place in at)
+        within, beyond = torch.stack([first, steps - last]), torch.stack([first - 1, steps - last + 1])
+        ends = torch.stack([beyond[0] < 0, beyond[1] > steps])  # at the origin, at the edge of the pupil
+        places = [place.clamp(0, steps) for place in (within, beyond)]
+        passes, blocked = (step[place] * reach for place in places)
+        inside, outside = (scanned.gather(1, place.expand(len(scanned), *place.shape)) for place in places)
         traced = arms * (steps + 1)
         # Rays near the zero of the first clearance along a chord, and halfway; at quarters if rays miss a surface.
         quarters = step.new_tensor([0.25, 0.5, 0.75]).reshape(3, 1, 1, 1, 1, 1)

@@ -13,7 +13,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -48,9 +48,10 @@ def trace_engine(engine: str) -> Iterator[None]:
     """Within the block, trace by this engine: "eager", "compiled" or "auto".
 
     "auto", the default, takes the compiled trace for tensors on the CPU once it has been compiled, compiles it for a
-    batch that is worth it, and else falls back to eager. "compiled" raises NoCompiler where it cannot be compiled, but
-    leaves to torch what it does not support: other devices, forward derivatives, transforms of torch.func, height maps,
-    kinds of sag that are not compiled, and Fresnel lenses other than even aspheres. Raises ValueError for another name.
+    large batch, and else falls back to eager. "compiled" raises NoCompiler where it cannot be compiled, but falls back
+    to eager for all that the compiled trace does not support: other devices, forward derivatives, transforms of
+    torch.func, height maps, kinds of sag that are not compiled, and Fresnel lenses other than even aspheres. Raises
+    ValueError for another name.
     """
     token = _engine.set(_checked(engine, "trace_engine"))
     try:
@@ -80,7 +81,7 @@ def prepare() -> str:
 
 
 def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
-    """Whether the compiled trace carries these rays; numbers: any number of the lens, for its device and dtype."""
+    """Whether the compiled trace is used for these rays; numbers: a number of the lens, for its device."""
     requested = engine()
     dtypes = {part.dtype for part in (rays.direction, rays.position, rays.opl) if part is not None}
     if (
@@ -117,7 +118,16 @@ _TURN, _PLANE, _SPHERE, _CONIC = range(-1, 3)  # and the codes of shapes.KINDS
 _WITH_SAG_TERMS, _FRAME = 3, 4  # kWithSagTerms of sags.h; kFrame of sag_terms.h, its numbers before the coefficients
 _NONE, _REFRACT, _REFLECT = range(3)
 
-#: What a phase becomes before it is traced, by `Form` of paths.h.
+#: Codes of the kinds of sag, of shapes.KINDS, that the compiled trace supports.
+_CODES = {name: kind.code for name, kind in KINDS.items() if kind.code is not None}
+
+#: The powers about a centre of sag terms that the compiled trace supports, by the name of their class.
+_POWERS = {name: kind.powers for name, kind in SAG_TERMS.items() if kind.powers is not None}
+
+#: Codes of the shapes of apertures that the compiled trace supports.
+_SHAPES = {name: shape.code for name, shape in SHAPES.items() if shape.code is not None}
+
+#: Forms of phases in the compiled trace, by `Form` of paths.h.
 FORMS = (None, PolynomialPath, RadialPath, IdealLens, HologramPath, Facets)
 
 
@@ -165,22 +175,23 @@ def is_expressible(surface: Surface) -> bool:
         flat = surface.kind == EVEN and surface.sag_terms is None and not surface.is_mirror
         if not (flat if kind.flat else kind.slopes or kind.path is not None):
             return False
-    if any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
+    if any(aperture.shape not in _SHAPES for aperture in surface.apertures):
         return False
     if surface.sag_terms is not None:
-        kind, numbers = SAG_TERMS[type(surface.sag_terms).__name__], tree_leaves(surface.sag_terms)
-        few = kind.compiled is None or all(number.numel() <= kind.compiled for number in numbers)
+        name, numbers = type(surface.sag_terms).__name__, tree_leaves(surface.sag_terms)
+        most = SAG_TERMS[name].compiled
+        few = most is None or all(number.numel() <= most for number in numbers)
         alike = isinstance(surface.sag_terms, PowerSag) or all(number.dim() <= 1 for number in numbers)  # for all rays
-        if not (surface.kind == EVEN and kind.powers is not None and few and alike):
+        if not (surface.kind == EVEN and name in _POWERS and few and alike):
             return False
-    kind = KINDS[surface.kind]
-    return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)
+    most = KINDS[surface.kind].compiled
+    return surface.coefficients is None or (surface.kind in _CODES and len(surface.coefficients) <= most)
 
 
 class _Table:
     """The numbers that rows point to, and the constants."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.numbers: list[Tensor] = []
         self.constants: list[float] = []
         self._positions: dict[int, int] = {}
@@ -204,7 +215,7 @@ class _Table:
         position = len(self.constants)
         self.constants.append(float("inf") if surface.semi_diameter is None else surface.semi_diameter)
         for aperture in surface.apertures:
-            code, sizes = SHAPES[aperture.shape].code, aperture.extent
+            code, sizes = _SHAPES[aperture.shape], aperture.extent
             numbers = [code, aperture.obscures, *aperture.centre, len(sizes), *sizes]
             self.constants += [float(n.detach() if isinstance(n, Tensor) else n) for n in numbers]
         return position
@@ -219,7 +230,7 @@ def structure_of(
 ) -> tuple[Structure, list[Tensor]]:
     """The structure of a run of surfaces, and its numbers, tensors (...); arguments as for `steps`.
 
-    Axes that turn before a surface have a row of their own; a coordinate break is nothing else.
+    A pose before a surface is a row by itself; a coordinate break has this row alone.
     """
     table, rows = _Table(), []
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
@@ -251,11 +262,11 @@ def _row(
     first_term, rim = table.first_of(terms), table.rim(surface)
     sag_terms: tuple[Tensor, ...] = ()
     if surface.sag_terms is not None:  # as sag_terms.h has them
-        *frame, powers = tree_leaves(SAG_TERMS[type(surface.sag_terms).__name__].powers(surface.sag_terms))
+        *frame, powers = tree_leaves(_POWERS[type(surface.sag_terms).__name__](surface.sag_terms))
         sag_terms = *frame, *powers.unbind(0)
         kind = _WITH_SAG_TERMS
     elif surface.coefficients is not None:
-        kind = KINDS[surface.kind].code
+        kind = _CODES[surface.kind]
     else:
         kind = _PLANE if surface.curvature is None else _SPHERE if surface.conic is None else _CONIC
     return _Row(
@@ -281,7 +292,7 @@ def _row(
 
 
 def _turn(table: _Table, surface: Surface, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Row:
-    """The way over a gap into the axes of a surface; numbers as in `Turn` and turns.h."""
+    """The row of a passage over a gap into the axes of a surface; numbers as in `Turn` and turns.h."""
     thickness = gap.thickness if isinstance(gap, Gap) else gap
     rows = passage(gap, surface.before)
     lag = 0.0 if thickness is None else n1 * (thickness * side)
@@ -293,7 +304,7 @@ def _turn(table: _Table, surface: Surface, gap: Tensor | Gap | None, side: int, 
 
 
 def _form_of(surface: Surface, n1: Tensor, wavelength: Tensor | None) -> tuple[int, Sequence[Tensor]]:
-    """Which of the FORMS a phase takes, and its numbers there."""
+    """The number of the form of a phase in FORMS, and the numbers of that form."""
     phase = surface.phase
     if phase is None:
         return 0, ()
@@ -305,6 +316,7 @@ def _form_of(surface: Surface, n1: Tensor, wavelength: Tensor | None) -> tuple[i
         vergence = torch.zeros_like(phase.power_x) if phase.vergence is None else phase.vergence
         return FORMS.index(IdealLens), (phase.power_x, phase.power_y, vergence)
     path = path_of(phase, wavelength)
+    assert path is not None  # by `is_expressible`
     if isinstance(path, HologramPath):
         return FORMS.index(HologramPath), (*path.first.unbind(0), *path.second.unbind(0), path.scale)
     numbers = path.coefficients.unbind(0)
@@ -338,7 +350,8 @@ def with_numbers(
 def _turned(row: _Row, numbers: Sequence[Tensor]) -> Surface:
     entries = list(numbers[row.coefficients : row.coefficients + row.terms])
     rotation = torch.stack([torch.stack(entries[3 * i : 3 * i + 3]) for i in range(3)])
-    return Surface(entries[12], before=Turn(rotation, torch.stack(entries[9:12]), entries[12]), is_break=True)
+    turn = Turn(rotation, torch.stack(entries[9:12]), entries[12])
+    return Surface(entries[12], before=turn, is_break=True)  # type: ignore[arg-type]  # a surface of the trace alone
 
 
 def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
@@ -351,8 +364,9 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
         phase = _phase_of(row, numbers)
     if row.kind == _WITH_SAG_TERMS:
         first, last = row.sag_term_numbers, row.sag_term_numbers + _FRAME + row.sag_term_count
-        frame, entries = numbers[first : first + _FRAME], numbers[first + _FRAME : last]
-        sag_terms = PowerSag(*frame, torch.stack(list(entries)) if entries else frame[0].new_zeros(0))
+        centre_x, centre_y, radius, height, *powers = numbers[first:last]
+        coefficients = torch.stack(powers) if powers else height.new_zeros(0)
+        sag_terms = PowerSag(centre_x, centre_y, radius, height, coefficients)
     return dataclasses.replace(
         surface,
         curvature=curvature,
@@ -367,14 +381,17 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
 
 def _phase_of(row: _Row, numbers: Sequence[Tensor]) -> Phase | None:
     form, entries = FORMS[row.phase], numbers[row.phase_numbers : row.phase_numbers + row.phase_terms]
-    if form in (None, IdealLens):
-        return form and IdealLens(*entries)
+    if form is None:
+        return None
+    if form is IdealLens:
+        power_x, power_y, vergence = entries
+        return IdealLens(power_x, power_y, vergence)
     if form is HologramPath:
         first, second = (torch.stack(torch.broadcast_tensors(*entries[i : i + 3])) for i in (0, 3))
         return HologramPath(first, second, entries[6])
-    constant, entries = ((entries[0],), entries[1:]) if form is PolynomialPath else ((), entries)
-    none = numbers[row.before].new_zeros(0)
-    return form(torch.stack(torch.broadcast_tensors(*entries)) if entries else none, *constant)
+    terms = entries[1:] if form is PolynomialPath else entries
+    coefficients = torch.stack(torch.broadcast_tensors(*terms)) if terms else numbers[row.before].new_zeros(0)
+    return PolynomialPath(coefficients, entries[0]) if form is PolynomialPath else RadialPath(coefficients)
 
 
 # -- calls -------------------------------------------------------------------------------------------------------------
@@ -397,15 +414,19 @@ class _Call(ctypes.Structure):
     )
 
 
-class Task(NamedTuple):
-    """Input of the compiled trace: contiguous rays, and the numbers (rows, K) in a table.
+#: Position (3, ...), direction (3, ...), path (...) or None, and the table of numbers (rows, K).
+Inputs = tuple[Tensor, Tensor, Tensor | None, Tensor]
 
-    inputs: position (3, ...), direction (3, ...), path (...) or None, and the table.
-    """
+#: Changes of position (3, V, ...), direction (3, V, ...) and path (V, ...) of rays by V variables.
+Changes = tuple[Tensor, Tensor, Tensor | None]
+
+
+class Task(NamedTuple):
+    """Input of the compiled trace: contiguous rays, and the numbers (rows, K) in a table."""
 
     structure: Structure
     valid: Tensor
-    inputs: tuple[Tensor, Tensor, Tensor | None, Tensor]
+    inputs: Inputs
 
 
 def task_of(
@@ -433,17 +454,19 @@ def task_of(
     opl = None if rays.opl is None else rays.opl.expand(shape).contiguous()
     # A row for all rays of the last axis; numbers that are the same in all rows are put into them together.
     single = [k for k, n in enumerate(numbers) if n.numel() == 1]
-    table = (
-        torch.stack([n if n.dim() == 0 else n.reshape(()) for n in map(numbers.__getitem__, single)])[None]
-        if single
-        else None
-    )
-    if len(single) < len(numbers):
-        several = [k for k, n in enumerate(numbers) if n.numel() > 1]
-        rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1).reshape(-1, len(several))
+    several = [k for k, n in enumerate(numbers) if n.numel() > 1]
+    parts = []
+    if single:
+        common = [n if n.dim() == 0 else n.reshape(()) for n in map(numbers.__getitem__, single)]
+        parts.append(torch.stack(common)[None])
+    if several:
+        rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1)
+        parts.append(rows.reshape(-1, len(several)))
+    table = parts[0]
+    if len(parts) == 2:
         places = {k: place for place, k in enumerate((*single, *several))}
         columns = torch.tensor([places[k] for k in range(len(numbers))])
-        table = rows if table is None else torch.cat([table.expand(len(rows), -1), rows], -1)[:, columns]
+        table = torch.cat([table.expand(len(parts[1]), -1), parts[1]], -1)[:, columns]
     return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
 
 
@@ -483,28 +506,49 @@ def trace_compiled(
 
 def forward(task: Task) -> Rays:
     """The rays behind the last surface, outside the graph."""
-    position, direction, opl, valid = _forward(task.structure, task.valid, *task.inputs)
-    return Rays(position, direction, valid, opl)
+    position, direction, opl, table = task.inputs
+    end = Rays(
+        torch.empty_like(position),
+        torch.empty_like(direction),
+        torch.empty_like(task.valid),
+        None if opl is None else torch.empty_like(opl),
+    )
+    call = _call(task)
+    call.rays_out, call.valid_out = _pointers(end.position, end.direction, end.opl), end.valid.data_ptr()
+    _run("forward", call, table)
+    return end
 
 
 class _Compiled(torch.autograd.Function):
     """Rays before the first surface and numbers of the lens -> rays behind the last."""
 
     @staticmethod
-    def forward(ctx, structure: Structure, again: Callable[..., Rays], valid, position, direction, opl, table):
+    def forward(
+        ctx: Any,
+        structure: Structure,
+        again: Callable[..., Rays],
+        valid: Tensor,
+        position: Tensor,
+        direction: Tensor,
+        opl: Tensor | None,
+        table: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         ctx.set_materialize_grads(False)
         ctx.structure, ctx.again = structure, again
         ctx.save_for_backward(valid, position, direction, opl, table)
-        *rays, valid_out = _forward(structure, valid, position, direction, opl, table)
-        ctx.mark_non_differentiable(valid_out)
-        return *rays, valid_out
+        end = forward(Task(structure, valid, (position, direction, opl, table)))
+        ctx.mark_non_differentiable(end.valid)
+        return end.position, end.direction, end.opl, end.valid
 
     @staticmethod
-    def backward(ctx, by_position, by_direction, by_opl, _):
+    def backward(
+        ctx: Any, by_position: Tensor | None, by_direction: Tensor | None, by_opl: Tensor | None, _: None
+    ) -> tuple[Tensor | None, ...]:
         cotangents, (valid, *inputs) = (by_position, by_direction, by_opl), ctx.saved_tensors
         needed = ctx.needs_input_grad[3:]
         if not torch.is_grad_enabled():
-            return None, None, None, *_backward(ctx.structure, valid, inputs, cotangents, any(needed[:3]))
+            task = Task(ctx.structure, valid, (*inputs,))
+            return None, None, None, *_backward(task, cotangents, any(needed[:3]))
         # The gradient as a graph of its own, through the eager trace.
         end = ctx.again(valid, *inputs)
         ends = (end.position, end.direction, end.opl)
@@ -516,22 +560,12 @@ class _Compiled(torch.autograd.Function):
         return None, None, None, *(None if x is None else next(gradients) for x in wanted)
 
 
-def _forward(structure: Structure, valid, position, direction, opl, table):
-    """Position, direction, path and validity behind the last surface."""
-    out = torch.empty_like(position), torch.empty_like(direction), None if opl is None else torch.empty_like(opl)
-    valid_out = torch.empty_like(valid)
-    call = _call(structure, valid, position, direction, opl, table)
-    call.rays_out, call.valid_out = _pointers(*out), valid_out.data_ptr()
-    _run("forward", call, table)
-    return *out, valid_out
-
-
-def _backward(structure: Structure, valid: Tensor, inputs, cotangents, wanted: bool):
+def _backward(task: Task, cotangents: Sequence[Tensor | None], wanted: bool) -> tuple[Tensor | None, ...]:
     """Derivatives by position, direction and path, if wanted, and by the table."""
-    *rays, table = inputs
+    *rays, table = task.inputs
     cotangents = [None if c is None else c.contiguous() for c in cotangents]
     by_rays = [torch.empty_like(x) if wanted and x is not None else None for x in rays]
-    call = _call(structure, valid, *inputs)
+    call = _call(task)
     call.cotangents, call.by_rays = _pointers(*cotangents), _pointers(*by_rays)
     total = np.zeros((call.rows, call.numbers))
     call.by_numbers = total.ctypes.data
@@ -554,57 +588,57 @@ class Pushed(NamedTuple):
     by_opl: Tensor | None
 
 
-def push(
-    task: Task,
-    changes: Tensor,
-    start: tuple[Tensor, Tensor, Tensor | None] | None = None,
-    *,
-    everywhere: bool = False,
-) -> Pushed:
+def push(task: Task, changes: Tensor, start: Changes | None = None, *, everywhere: bool = False) -> Pushed:
     """The rays behind the last surface, and how they change with the table and with the rays before the first.
 
-    changes: (V, rows, K), that of the table for each of V variables; start: those of position (3, V, ...), direction
-    (3, V, ...) and path (V, ...) before the first surface, or None where these rays stay. A lost ray does not change.
+    changes: (V, rows, K), that of the table for each of V variables; start: those of the rays before the first surface,
+    or None where these rays stay. A lost ray does not change.
     everywhere: the same behind each of the K rows of the structure, with a first axis more: position (3, K, ...), opl
     and valid (K, ...), by_position (3, K, V, ...). V may be 0. A ray is valid up to where it is lost.
     """
     position, direction, opl, table = task.inputs
     pages = (len(task.structure.layout),) if everywhere else ()
-    call = _call(task.structure, task.valid, *task.inputs)
+    call = _call(task)
     changes, shape = changes.contiguous(), task.valid.shape
     call.changes, call.change, call.everywhere = len(changes), changes.data_ptr(), everywhere
-    ends = [part.new_empty((3, *pages, *shape)) for part in (position, direction)]
-    ends.append(None if opl is None else opl.new_empty((*pages, *shape)))
-    valid = task.valid.new_empty((*pages, *shape))
-    call.rays_out, call.valid_out = _pointers(*ends), valid.data_ptr()
-    by = [changes.new_empty((3, *pages, len(changes), *shape)) for _ in range(2)]
-    by.append(None if opl is None else changes.new_empty((*pages, len(changes), *shape)))
-    call.changed = _pointers(*by)
+    end = Pushed(
+        position.new_empty((3, *pages, *shape)),
+        direction.new_empty((3, *pages, *shape)),
+        None if opl is None else opl.new_empty((*pages, *shape)),
+        task.valid.new_empty((*pages, *shape)),
+        changes.new_empty((3, *pages, len(changes), *shape)),
+        changes.new_empty((3, *pages, len(changes), *shape)),
+        None if opl is None else changes.new_empty((*pages, len(changes), *shape)),
+    )
+    call.rays_out, call.valid_out = _pointers(end.position, end.direction, end.opl), end.valid.data_ptr()
+    call.changed = _pointers(end.by_position, end.by_direction, end.by_opl)
     if start is not None:
-        start = [None if part is None else part.contiguous() for part in start]
-        call.at_start = _pointers(*start)
+        contiguous = [None if part is None else part.contiguous() for part in start]
+        call.at_start = _pointers(*contiguous)
     _run("tangents", call, table)
-    return Pushed(*ends, valid, *by)
+    return end
 
 
 def moved(task: Task) -> Rays:
     """The rays behind the last surface with their derivatives by the variables that rays or table carry."""
     count = next(len(part.tangents) for part in task.inputs if isinstance(part, MovingTensor))
-    tangents = [None if part is None else tangents_of(part, count) for part in task.inputs]
-    inputs = [None if part is None else value_of(part) for part in task.inputs]
+    position, direction, opl, table = task.inputs
     start = None
-    if any(isinstance(part, MovingTensor) for part in task.inputs[:3]):
-        start = *(part.movedim(1, 0) for part in tangents[:2]), tangents[2]
-    end = push(Task(task.structure, task.valid, (*inputs,)), tangents[3], start)
+    if any(isinstance(part, MovingTensor) for part in (position, direction, opl)):
+        by_position, by_direction = (tangents_of(part, count).movedim(1, 0) for part in (position, direction))
+        start = by_position, by_direction, None if opl is None else tangents_of(opl, count)
+    inputs = value_of(position), value_of(direction), None if opl is None else value_of(opl), value_of(table)
+    end = push(Task(task.structure, task.valid, inputs), tangents_of(table, count), start)
     return Rays(
         with_tangents(end.position, end.by_position.movedim(1, 0)),
         with_tangents(end.direction, end.by_direction.movedim(1, 0)),
         end.valid,
-        None if end.opl is None else with_tangents(end.opl, end.by_opl),
+        None if end.opl is None or end.by_opl is None else with_tangents(end.opl, end.by_opl),
     )
 
 
-def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:
+def _call(task: Task) -> _Call:
+    structure, valid, (position, direction, opl, table) = task
     rows, numbers = table.shape
     return _Call(
         layout=structure.layout.ctypes.data,
@@ -619,7 +653,7 @@ def _call(structure: Structure, valid, position, direction, opl, table) -> _Call
     )
 
 
-def _pointers(position: Tensor | None, direction: Tensor | None, opl: Tensor | None):
+def _pointers(position: Tensor | None, direction: Tensor | None, opl: Tensor | None) -> ctypes.Array:
     parts = [None if t is None else t.data_ptr() + i * (t.nbytes // 3) for t in (position, direction) for i in range(3)]
     return (ctypes.c_void_p * 7)(*parts, None if opl is None else opl.data_ptr())
 

@@ -38,7 +38,7 @@ _FOLDER = getattr(os, "O_PATH", 0) | sum(getattr(os, name, 0) for name in ("O_DI
 
 
 class Untrusted(RaytraceError, OSError):
-    """Another user could write here; the message says where, and who."""
+    """Another user could write in a folder; the message has the folder and its owner."""
 
 
 def open_folder(path: Path, *, make: bool = False) -> int:
@@ -67,9 +67,9 @@ def open_folder(path: Path, *, make: bool = False) -> int:
                 names = [*target.parts[target.is_absolute() :], *names]
                 name = target.root or "."
             so_far = Path(os.path.normpath(so_far / name))
-            there = _step(here, name, so_far, make=make)
+            step = _step(here, name, so_far, make=make)
             os.close(here)
-            here = there
+            here = step
     except BaseException:
         os.close(here)
         raise
@@ -217,12 +217,12 @@ def is_built() -> bool:
         return False
 
 
-def compiler(named: str | None = None) -> tuple[str, ...]:
-    """The C++ compiler, its path and options: the one named, the environment's CXX, or the first of c++, g++, clang++.
+def compiler(command: str | None = None) -> tuple[str, ...]:
+    """The C++ compiler, its path and options: the command, by default CXX of the environment or c++, g++ or clang++.
 
     Searched in the absolute folders of PATH alone, never in the current one. Raises NoCompiler.
     """
-    wish = named or os.environ.get("CXX")
+    wish = command or os.environ.get("CXX")
     try:
         candidates = [tuple(shlex.split(wish))] if wish and wish.strip() else [(name,) for name in _COMPILERS]
     except ValueError as error:
@@ -341,7 +341,7 @@ def _build(folder: Path) -> Path:
         for flags in _TRIED:
             with ThreadPoolExecutor(len(_REALS)) as side_by_side:
                 each = side_by_side.map(functools.partial(compiled, flags), _REALS)
-                done = max(each, key=lambda one: one.returncode != 0)
+                done = max(each, key=lambda run: run.returncode != 0)
             if done.returncode == 0:
                 done = run_compiler(*program, "-shared", *objects.values(), "-o", str(made), folder=folder)
             if done.returncode == 0:

@@ -13,8 +13,8 @@ from raytrace.tracing.trace import is_bent
 def working_f_number(lens: Lens) -> Tensor:
     """1/(2 n′ sin θ′) of the real marginal ray of the axial object point at the primary wavelength, ().
 
-    The ray goes through the rim of the (aimed) pupil, θ′ is its angle to the axis behind the lens: what diffraction and
-    light depend on. `FirstOrder.paraxial_working_f_number` has the slope of the paraxial ray. inf where it runs along
+    The ray passes the rim of the (aimed) pupil; θ′, its angle to the axis behind the lens, determines diffraction and
+    illuminance. `FirstOrder.paraxial_working_f_number` has the slope of the paraxial ray. inf where it runs along
     the axis, nan where it is lost. Where the axis bends θ′ is half the angle between two rays of opposite rims.
     """
     wavelength = lens.primary[None]

@@ -8,6 +8,7 @@ weights W needs no second trace:
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypedDict, Unpack
 
 import scipy.optimize
 import torch
@@ -29,7 +30,19 @@ from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_
 from raytrace.tracing.trace import is_bent, side_behind
 from raytrace.words import RaytraceError
 
-_RINGS = 12  # of the pupil, where focus on the axis is found
+_RINGS = 12  # of the pupil, for the focus on the axis
+
+
+class Conjugates(TypedDict, total=False):
+    """Options of `bundles`."""
+
+    rings: int | None
+    object_distances: Sequence[Tensor | float] | Tensor | None
+    distance_weights: Sequence[float] | Tensor | None
+    fields: Tensor | None
+    wavelengths: Tensor | None
+    field_weights: Tensor | None
+    wavelength_weights: Tensor | None
 
 
 class NoImage(RaytraceError, ValueError):
@@ -49,7 +62,8 @@ def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
     centred = points - (share * points).sum(-1, keepdim=True)
     tilted = slopes - (share * slopes).sum(-1, keepdim=True)
     moments = (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
-    return where_lit(total[..., 0] != 0, *moments, empty=empty)
+    covariance, variance = where_lit(total[..., 0] != 0, *moments, empty=empty)
+    return covariance, variance
 
 
 def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
@@ -76,7 +90,9 @@ def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, 
     return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
 
 
-def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+def focus_of_rms(
+    lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene: Unpack[Conjugates]
+) -> Tensor:
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
     pupil, weights, scene: as for `bundles`. Differentiable in every number of the lens. empty: "nan" ignores spots
@@ -96,7 +112,7 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
     return torch.where(variance > 0, lens.surfaces[-2].thickness + shift, torch.nan)
 
 
-def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
+def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene: Unpack[Conjugates]) -> Tensor:
     """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
 
     Arguments as for `focus_of_rms`, whose result starts the search. Rays are traced once, to the sensor's present
@@ -123,7 +139,9 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
     return focus_of_merit(merit, start).detach()
 
 
-def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+def mean_rms_radius(
+    lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene: Unpack[Conjugates]
+) -> Tensor:
     """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
 
     Arguments as for `focus_of_rms`, which minimises it. Spots without rays are ignored; without any ray it is nan or,
@@ -149,8 +167,8 @@ def bundles(
     weights: Tensor,
     *,
     rings: int | None = None,
-    object_distances: Sequence[Tensor | float] | None = None,
-    distance_weights: Sequence[float] | None = None,
+    object_distances: Sequence[Tensor | float] | Tensor | None = None,
+    distance_weights: Sequence[float] | Tensor | None = None,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
     field_weights: Tensor | None = None,
@@ -166,10 +184,10 @@ def bundles(
     distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
     distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
     for distance, distance_weight in zip(distances, distance_weights, strict=True):
-        view, scene = with_object_distance(lens, distance), {"fields": fields, "wavelengths": wavelengths}
+        view = with_object_distance(lens, distance)
         if rings is not None:
-            pupil, weights = clear_pupil(view, rings=rings, arms=4 * rings, **scene)
-        rays = image_rays(view, pupil, **scene)
+            pupil, weights = clear_pupil(view, fields=fields, wavelengths=wavelengths, rings=rings, arms=4 * rings)
+        rays = image_rays(view, pupil, fields=fields, wavelengths=wavelengths)
         share = rays.position.new_full(rays.shape[:-1], distance_weight)
         share = share if field_weights is None else share * field_weights[:, None]
         yield rays, weights, share if wavelength_weights is None else share * wavelength_weights
@@ -202,8 +220,8 @@ def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
     if not is_bent(lens):
         return paraxial_image_distance(lens, object_distances)
     base = base_ray(with_object_distance(lens, object_distances))
-    there = torch.isfinite(base.image_distance)
-    total, count = torch.where(there, base.image_distance, 0.0).sum(0), there.sum(0)
+    finite = torch.isfinite(base.image_distance)
+    total, count = torch.where(finite, base.image_distance, 0.0).sum(0), finite.sum(0)
     ahead = torch.where(count > 0, total / count.clamp_min(1), torch.inf) - base.way_to_image
     return lens.surfaces[-2].thickness + ahead * base.direction[2] / along_normal(lens)
 
@@ -252,8 +270,10 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
     return torch.where(rays.valid, rays.position[:2], 0.0), torch.where(rays.valid, slopes, 0.0)
 
 
-def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
-    """Sensor distance (scalar, mm) that minimises a differentiable merit of it.
+def focus_of_merit(
+    merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10
+) -> Tensor:
+    """Sensor distance (scalar, mm) that minimises a differentiable merit function of it.
 
     merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
     step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's

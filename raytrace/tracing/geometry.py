@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import detached, dot_2, safe_sqrt, value
+from raytrace.maths.numerics import Number, detached, dot_2, safe_sqrt, value
 from raytrace.system.lens import Lens, media, per_lens
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface, is_freeform, sag_at
+from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import lens_steps
 from raytrace.words import RaytraceWarning, calling_level
@@ -60,7 +60,7 @@ class Defect:
 def defects(lens: Lens) -> tuple[Defect, ...]:
     """Everything of a lens, in its configuration, that cannot be made."""
     lens = detached(lens)
-    heights, found = semi_diameters(lens), []
+    heights, result = semi_diameters(lens), []
     for k, (surface, height) in enumerate(zip(lens.surfaces, heights, strict=True)):
         edge = math.inf if k == 0 or surface.is_break else _edge_radius(surface)
         if math.isfinite(edge) and height >= edge:
@@ -68,7 +68,7 @@ def defects(lens: Lens) -> tuple[Defect, ...]:
                 f"surface {k} does not reach its semi-diameter of {height:.6g} mm: it closes at {edge:.6g} mm "
                 f"(|c| h √(1+k) = {height / edge:.4g}, less than 1 can be made)"
             )
-            found.append(Defect(k, "reach", height - edge, words))
+            result.append(Defect(k, "reach", height - edge, words))
     spaces, is_glass = gaps(lens), np.array([abs(float(index)) > 1.01 for index in media(lens, lens.primary)])
     ends = np.arange(len(heights))
     for k, end, _ in spaces:
@@ -76,16 +76,16 @@ def defects(lens: Lens) -> tuple[Defect, ...]:
     each = rims(np.array(heights), ends, is_glass & (ends > np.arange(len(ends))))
     for k, end, side in spaces:
         medium, clear = ("glass", min(heights[k], heights[end])) if is_glass[k] else ("air", float(each[k]))
-        found += _of_gap(lens, k, end, side, medium, clear, float(each[k]))
-    return tuple(found)
+        result += _of_gap(lens, k, end, side, medium, clear, float(each[k]))
+    return tuple(result)
 
 
 def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
     """`defects`, each with a warning Unbuildable."""
-    found = defects(lens)
-    for defect in found:
+    every = defects(lens)
+    for defect in every:
         warnings.warn(defect.words, Unbuildable, stacklevel=calling_level())
-    return found
+    return every
 
 
 def fixed_semi_diameters(lens: Lens) -> dict[int, float]:
@@ -109,19 +109,19 @@ def semi_diameter_margin(lens: Lens, k: int) -> tuple[float, float]:
 def semi_diameters(lens: Lens) -> list[float]:
     """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
     fixed, last = fixed_semi_diameters(lens), len(lens.surfaces) - 1
-    found = [fixed.get(k, math.nan) for k in range(last + 1)]
-    if all(map(math.isfinite, found[1:last])):
-        return found
+    sizes = [fixed.get(k, math.nan) for k in range(last + 1)]
+    if all(map(math.isfinite, sizes[1:last])):
+        return sizes
     try:
         reaches = [math.nan, *map(float, _reaches(lens, last))]
     except (ValueError, RuntimeError):
         reaches = [math.nan] * (last + 1)
     for k, reach in enumerate(reaches):
-        if math.isnan(found[k]):
+        if math.isnan(sizes[k]):
             factor, length = semi_diameter_margin(lens, k)
-            found[k] = factor * reach + length
+            sizes[k] = factor * reach + length
     stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
-    return [own if math.isnan(reach) else reach for reach, own in zip(found, stored, strict=True)]
+    return [of_file if math.isnan(size) else size for size, of_file in zip(sizes, stored, strict=True)]
 
 
 def semi_diameter(lens: Lens, k: int) -> Tensor:
@@ -143,7 +143,7 @@ def _reaches(lens: Lens, last: int) -> list[Tensor]:
     return reaches
 
 
-def rims(heights, ends: np.ndarray, is_glass: np.ndarray):
+def rims(heights: Number, ends: np.ndarray, is_glass: np.ndarray) -> Number:
     """mm (S,), of the edge of the gap behind every surface: of glass the larger of the clear heights of its two faces,
     of air the smaller of the rims of the elements on both sides; a surface in air is its own rim.
 
@@ -157,7 +157,7 @@ def rims(heights, ends: np.ndarray, is_glass: np.ndarray):
     return np.where(is_glass, of_glass, np.minimum(of_element, of_element[ends]))
 
 
-def edge_thickness(thickness, front, back):
+def edge_thickness(thickness: Number, front: Number, back: Number) -> Number:
     """mm between two surfaces where their sags are `front` and `back`; of any number type."""
     return thickness + (back - front)
 
@@ -174,12 +174,13 @@ def edge_radius(surface: Surface) -> float:
 
 def _edge_radius(surface: Surface) -> float:
     """mm at which a surface closes, along x or along y; inf where it does not."""
-    if not is_freeform(surface):
+    form, a = KINDS[surface.kind].form, surface.coefficients
+    if form is None or a is None:
         return edge_radius(surface)
-    a = surface.coefficients.double()
+    a = a.double()
     c, k = (a.new_zeros(()) if number is None else number.double() for number in (surface.curvature, surface.conic))
     far = a.new_tensor(1e9)
-    ends = KINDS[surface.kind].form.extent(c, k, a, far)
+    ends = form.extent(c, k, a, far)
     return min(float(end) if end < far else math.inf for end in ends)
 
 
@@ -218,10 +219,9 @@ def _of_gap(lens: Lens, k: int, end: int, side: float, medium: str, clear: float
         left = edge_thickness(gap, side * _sag(front, x * r, y * r), side * _sag(back, x * r, y * r))
         within = left[r <= clear]
         if within.min() < -_LEAST:
-            at, least = float(r[left < 0][0]), float(within.min())
-            words = (
-                f"surfaces {k} and {end} cross {at:.4g} mm from the axis: {medium} of {least:.4g} mm within the edge"
-            )
+            height, least = float(r[left < 0][0]), float(within.min())
+            where = f"surfaces {k} and {end} cross {height:.4g} mm from the axis"
+            words = f"{where}: {medium} of {least:.4g} mm within the edge"
             return [Defect(k, "crossing", least, words)]
         if left[-1] < -_LEAST:
             edge = float(left[-1])
@@ -264,20 +264,20 @@ def frames(lens: Lens) -> list[Frame]:
     distance = lens.surfaces[0].thickness
     axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
     here = Frame(torch.zeros_like(axes[0]), axes)
-    found = [_posed(Frame(-distance * axes[2], axes), lens.surfaces[0].before)]
+    result = [_posed(Frame(-distance * axes[2], axes), lens.surfaces[0].before)]
     for surface in lens.surfaces[1:]:
         here = _posed(here, surface.before)
-        found.append(here)
+        result.append(here)
         here = _posed(here, surface.after)
         here = Frame(here.origin + surface.thickness * here.axes[:, 2], here.axes)
-    return found
+    return result
 
 
 def _posed(frame: Frame, pose: Pose | None) -> Frame:
     if pose is None:
         return frame
-    one = torch.eye(3, dtype=frame.axes.dtype, device=frame.axes.device)
-    zero = list(torch.zeros_like(one[0]))
+    axes = torch.eye(3, dtype=frame.axes.dtype, device=frame.axes.device)
+    zero = list(torch.zeros_like(axes[0]))
     vertex = torch.stack(list(point_out(pose, zero)))
-    turned = torch.stack([torch.stack(list(direction_out(pose, list(axis)))) for axis in one], 1)
+    turned = torch.stack([torch.stack(list(direction_out(pose, list(axis)))) for axis in axes], 1)
     return Frame(frame.outside(vertex), frame.axes @ turned)

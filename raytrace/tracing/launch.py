@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import (
+    Number,
     broadcast_shape,
     detached,
     dot,
@@ -56,7 +57,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
-from raytrace.tracing.paraxial import CONES, Beam, axial_beam, cone_angle, field_scale
+from raytrace.tracing.paraxial import CONES, Beam, FirstOrder, axial_beam, cone_angle, field_scale
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
 from raytrace.words import RaytraceWarning, calling_level, named_value, option
 
@@ -96,7 +97,7 @@ def launch(
     lens: Lens,
     pupil: Tensor,
     *,
-    fields: Tensor | None = None,
+    fields: Tensor | Sequence | None = None,
     wavelengths: Tensor | None = None,
     ray_aiming: str | None = None,
 ) -> Rays:
@@ -110,6 +111,7 @@ def launch(
     vignetted = vignette(lens, fields[:, :, None, None], pupil)
     field, wavelength = fields[:, :, None, None], wavelengths[:, None]
     rays = rays_of_field(lens, field, vignetted, wavelength=wavelength, ray_aiming=ray_aiming)
+    assert rays.opl is not None  # as `start` makes rays with paths
     batch = broadcast_shape(rays.shape, rays.opl.shape)
     position, direction = rays.position.expand(3, *batch), rays.direction.expand(3, *batch)
     return Rays(position, direction, rays.valid.expand(batch), rays.opl.expand(batch))
@@ -139,8 +141,8 @@ def rays_of_field(
 
     if _is_aimed(lens):
         radius = _aimed_radius(lens, beam, entrance)
-        pupil, found = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
-        reached = reached & found
+        pupil, aimed = aim_at_stop(lens, through, pupil, turned, wavelength, radius)
+        reached = reached & aimed
     rays = through(pupil)
     return dataclasses.replace(rays, valid=rays.valid & reached)
 
@@ -156,12 +158,12 @@ def rays_from_point(point: Tensor, aim: Tensor, *, index: Tensor) -> Rays:
     return start(aim, chord, index * path_from_point(aim, point, dot(chord, unit(chord)), dot(point, unit(point))))
 
 
-def path_from_point(aim, point, chord, distance):
+def path_from_point(aim: Number, point: Number, chord: Number, distance: Number) -> Number:
     """Path in mm (n = 1) at aim points A less the distance |O| of the point; chord: |A - O|. Any number type."""
     return (dot(aim, aim) - 2 * dot(aim, point)) / (chord + distance)
 
 
-def path_towards_lens(path, distance, *, backward, virtual, nearer):
+def path_towards_lens(path: Number, distance: Number, *, backward: Number, virtual: Number, nearer: Number) -> Number:
     """Path of a ray that travels towards +z, started at the nearer of object point and aim point. Any number type.
 
     path: as of `path_from_point`; distance: |O|; backward: whether A lies before O; virtual: O behind surface 1;
@@ -193,7 +195,7 @@ def is_at_infinity(lens: Lens) -> bool:
 def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm.
 
-    And whether there are such (...): where no chief ray reaches a real image height, the field is on the axis.
+    And whether a chief ray reaches the real image height (...); where none does, the field is on the axis.
     """
     estimate = paraxial_field(lens, field, beam)
     if lens.fields.kind != "real_image_height":
@@ -207,8 +209,8 @@ def object_field(lens: Lens, field: Tensor, beam: Beam) -> tuple[Tensor, Tensor]
     return aim_at_image(lens, through, field, estimate, radius)
 
 
-def paraxial_field(lens: Lens, field: Tensor, beam: Beam) -> Tensor:
-    """As `object_field`, real image heights as if they were paraxial ones."""
+def paraxial_field(lens: Lens, field: Tensor, beam: Beam | FirstOrder) -> Tensor:
+    """As `object_field`, with real image heights taken as paraxial ones."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind == "object_height":
         if at_infinity:
@@ -218,7 +220,7 @@ def paraxial_field(lens: Lens, field: Tensor, beam: Beam) -> Tensor:
     return extent if kind == "angle" and at_infinity else _scaled(extent, _paraxial_scale(lens, beam))
 
 
-def field_of_object(lens: Lens, extent: Tensor, beam: Beam) -> Tensor:
+def field_of_object(lens: Lens, extent: Tensor, beam: Beam | FirstOrder) -> Tensor:
     """Field points (2, ...) of slopes, or object heights in mm, (2, ...): the inverse of `paraxial_field`."""
     kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind != "object_height" and not (kind == "angle" and at_infinity):
@@ -234,7 +236,7 @@ def object_point(lens: Lens, height: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(x, y, z - source.thickness))
 
 
-def _paraxial_scale(lens: Lens, beam: Beam) -> Tensor | float:
+def _paraxial_scale(lens: Lens, beam: Beam | FirstOrder) -> Tensor | float:
     """`field_scale` of the kind of field of a lens."""
     return field_scale(
         lens.fields.kind,
@@ -289,7 +291,7 @@ def stop_radius(lens: Lens) -> Tensor:
 
 
 def _stop_radius(lens: Lens, ray_aiming: str, beam: Beam, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
-    """And whether the real marginal ray reaches the stop; None if that is not traced."""
+    """The radius of the stop, and whether the real marginal ray reaches it; None if that ray is not traced."""
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value, None
     estimate = beam.stop_height.abs() if entrance is None else entrance.radius
@@ -309,7 +311,7 @@ def _signed(radius: Tensor, beam: Beam, entrance: Entrance | None) -> Tensor:
 
 
 def _aimed_radius(lens: Lens, beam: Beam, entrance: Entrance | None) -> Tensor:
-    """As `_signed`; warns MarginalRayLost."""
+    """The radius of the stop with the sign of `_signed`; warns MarginalRayLost."""
     radius, arrives = _stop_radius(lens, lens.ray_aiming, beam, entrance)
     if arrives is not None and is_any(~arrives):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
@@ -330,10 +332,12 @@ def _through_entrance_pupil(
                 "object space is telecentric, which needs an aperture given as object NA or cone angle, not "
                 f"{lens.aperture.kind}"
             )
+        assert point is not None  # `lens.check` refuses objects at infinity
         radius, depth = -point[2] * torch.tan(cone_angle(lens, index)), torch.zeros_like(depth)
         aim_x, aim_y = point[0] + radius * pupil[0], point[1] + radius * pupil[1]
     elif entrance is not None:
-        aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
+        spread = _turned(entrance.spread, pupil)
+        aim_x, aim_y = entrance.centre[0] + spread[0], entrance.centre[1] + spread[1]
         depth = entrance.position
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
@@ -359,7 +363,7 @@ def _through_entrance_pupil(
     )
 
 
-def _scaled(field: Tensor, factor: Tensor) -> Tensor:
+def _scaled(field: Tensor, factor: Tensor | float) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
 
@@ -396,6 +400,7 @@ def factors_at(lens: Lens, fields: Tensor) -> Tensor | None:
 def _map_of(lens: Lens, field: Tensor) -> Tensor:
     """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...), with the derivatives of the interpolation everywhere."""
     listed = torch.stack([lens.fields.x, lens.fields.y])
+    assert lens.fields.vignetting is not None
     vdx, vdy, vcx, vcy, angle = lens.fields.vignetting
     angle = torch.deg2rad(angle)
     maps = torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy])
@@ -404,7 +409,7 @@ def _map_of(lens: Lens, field: Tensor) -> Tensor:
     same = (listed.reshape(2, -1, *(1,) * (field.dim() - 1)) == field[:, None]).all(0)
     at_listed = maps[:, same.to(torch.int64).argmax(0)]
     if not any(map(varies, (field, lens.fields.x, lens.fields.y))) and not is_any(~same.any(0)):
-        return at_listed  # what lies between fields serves derivatives by the field alone
+        return at_listed  # the interpolation is needed for derivatives by the field alone
     axes = (1,) * (field.dim() - 1)
     listed, is_first = listed.reshape(2, -1, *axes), (first.diff(prepend=first[:1] - 1) > 0).reshape(-1, *axes)
     between = _between(listed, maps.reshape(5, -1, *axes), is_first, field[:, None])
@@ -484,16 +489,16 @@ def _at_least(maps: Tensor, knots: Tensor) -> Tensor:
     return torch.gather(maps, 1, place.expand(5, *place.shape))
 
 
-def _rise(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
-    """Maps (5, ...) at (1, ...), less that of the smallest knot; linear between knots (F, ...), constant outside.
+def _rise(knots: Tensor, maps: Tensor, place: Tensor) -> Tensor:
+    """Maps (5, ...) at a place (1, ...), less that of the smallest knot.
 
-    The derivative at a knot is the mean of those on both sides.
+    They are linear between knots (F, ...) and constant outside; at a knot the derivative is the mean of both sides.
     """
     knots, order = knots.sort(0)
     maps = torch.gather(maps, 1, order.expand_as(maps))
     width = knots.diff(dim=0)
     # Equal arguments of maximum and minimum have half of the derivative each.
-    beyond = torch.minimum(torch.maximum(at - knots[:-1], torch.zeros_like(at)), width)
+    beyond = torch.minimum(torch.maximum(place - knots[:-1], torch.zeros_like(place)), width)
     return (safe_divide(beyond, width) * maps.diff(dim=1)).sum(1)
 
 
@@ -545,13 +550,13 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
-    """Warn UnfilledStop by the words of `unfilled`, if there are any."""
+    """Warn UnfilledStop with the text of `unfilled`, if it is not empty."""
     if words := unfilled(lens, fields, ray_aiming=ray_aiming):
         warnings.warn(words, UnfilledStop, stacklevel=calling_level())
 
 
 def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> str:
-    """Words for the field of (2, F) that misses the stop most, if it does by more than TOLERANCE; else empty.
+    """A text about the field of (2, F) whose rays miss the stop most, if by more than TOLERANCE; else empty.
 
     Of more than MOST_FIELDS fields so many are measured, and the largest one; of more than MOST_LENSES lenses so many,
     evenly spaced in the batch. Fields without rays at the stop are left to LostRays. Nothing is traced if rays are
@@ -562,24 +567,25 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
         return ""
     if fields.shape[1] > MOST_FIELDS:
         fields = fields[:, [*_spread(fields.shape[1], MOST_FIELDS), int(fields.norm(dim=0).argmax())]]
-    if lens.count == 0:
+    count = lens.count
+    if count == 0:
         return ""
-    if (lens.count or 1) > MOST_LENSES:
-        lens = one_lens(lens, torch.tensor(_spread(lens.count, MOST_LENSES), device=lens.wavelengths.device))
+    if count is not None and count > MOST_LENSES:
+        lens = one_lens(lens, torch.tensor(_spread(count, MOST_LENSES), device=lens.wavelengths.device))
     beams = filling(lens, fields)
     worst = torch.where(beams.lost, 0.0, torch.maximum(beams.chief, beams.marginal))
     if worst.dim() > 1:  # of a batch: the lens whose stop is missed most
-        at = int(worst.amax(-1).argmax())
-        radius = beams.radius.expand(len(worst), 1, 1, 1)[at, 0, 0, 0]
-        beams, worst = Filling(beams.chief[at], beams.marginal[at], beams.lost[at], radius), worst[at]
+        k = int(worst.amax(-1).argmax())
+        radius = beams.radius.expand(len(worst), 1, 1, 1)[k, 0, 0, 0]
+        beams, worst = Filling(beams.chief[k], beams.marginal[k], beams.lost[k], radius), worst[k]
     if not bool((worst > TOLERANCE).any() & (beams.radius > 1e-9)):  # a point has no rim
         return ""
-    at = int(worst.argmax())
-    named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
+    f = int(worst.argmax())
+    field = f"{name_of_field(fields[:, f])} {FIELD_UNITS[lens.fields.kind]}"
     many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
     return (
-        f"field {named}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
-        f"{_words(beams.chief[at], 'centre')}, marginal rays {_words(beams.marginal[at], 'rim')}"
+        f"field {field}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
+        f"{_words(beams.chief[f], 'centre')}, marginal rays {_words(beams.marginal[f], 'rim')}"
         f"{many if len(worst) > 1 else ''}; {option('ray_aiming', 'real')} aims them, in Python "
         "lens.at(ray_aiming='real')"
     )

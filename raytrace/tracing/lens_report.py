@@ -13,8 +13,9 @@ from raytrace.maths.numerics import detached, summary, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
-from raytrace.system.phases import IdealLens
+from raytrace.system.phases import IdealLens, Phase
 from raytrace.system.poses import Pose
+from raytrace.system.sag_terms import SagTerms
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, vertex_curvature
 from raytrace.tracing.base_ray import base_ray
@@ -68,7 +69,7 @@ def remarks(surface: Surface) -> list[str]:
 
 
 def entries(surface: Surface) -> dict:
-    """The same for a document: keys that only such surfaces have."""
+    """The kind of sag, sag terms, phase and poses of a surface for a document; empty for a plain surface."""
     document: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
     for name, part in (("sag_terms", surface.sag_terms), ("phase", surface.phase)):
         if part is not None:
@@ -89,7 +90,7 @@ def _pose(pose: Pose | None) -> list[str]:
     return parts[::-1] if pose.tilts_first else parts
 
 
-def _fields(part) -> dict:
+def _fields(part: SagTerms | Phase | Pose) -> dict:
     """The fields of a value that are not None, tensors as numbers."""
     document = {}
     for field in dataclasses.fields(part):
@@ -212,8 +213,8 @@ class Info(Result):
             *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
         ]
-        shown = {**self.columns(), "radius": ["-" if s.is_break else _radius(s) for s in lens.surfaces]}
-        return [Table(shown, lines)]
+        radius = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
+        return [Table({**self.columns(), "radius": radius}, lines)]
 
 
 def info(lens: Lens) -> Info:
@@ -266,7 +267,7 @@ def _figures(lens: Lens) -> list[float]:
 
 
 def _telecentric(lens: Lens) -> list[str]:
-    """The spaces in which chief rays are parallel: where the pupil is a thousand lengths of the lens away, and more."""
+    """The spaces in which chief rays are parallel: the pupil is at least a thousand lengths of the lens away."""
     data = first_order(lens)
     far = 1e3 * max(sum(abs(float(surface.thickness)) for surface in lens.surfaces[1:-1]), 1.0)
     object_space = lens.fields.telecentric or abs(float(data.entrance_pupil_position)) > far

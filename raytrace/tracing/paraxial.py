@@ -10,10 +10,13 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import quotient, select, value, value_of
+from raytrace.maths.numerics import Number, quotient, select, value, value_of
 from raytrace.maths.result import Column, Result, Table, flat
 from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, shared
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
+
+#: A, B, C, D of y′ = A y + B ω, ω′ = C y + D ω.
+Matrix = tuple[Number, Number, Number, Number]
 
 #: Lines of a report: text, entry of FirstOrder, unit; further ones are printed of first-order data alone.
 LINES = (
@@ -44,7 +47,7 @@ FURTHER_LINES = (
 
 @value
 class FirstOrder(Result):
-    """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
+    """First-order data of a lens at its primary wavelength or at other ones; every entry (...), mm.
 
     power: -ω′/y₁ in 1/mm.
     effective_focal_length: -y₁/u′ in image space, u′ taken along the light: positive for a concave mirror.
@@ -105,7 +108,7 @@ class FirstOrder(Result):
         return [Table(printed, [f"first-order data of {count} lenses or wavelengths"] if count > 1 else ())]
 
 
-def brackets(powers: Sequence, gaps: Sequence) -> tuple:
+def brackets(powers: Sequence[Number], gaps: Sequence[Number]) -> Matrix:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω; arguments as for `ynu`. Gauss's brackets (Herzberger 1943)."""
     (A, C), (B, D) = (ynu(y, omega, powers, gaps)[-1] for y, omega in ((1.0, 0.0), (0.0, 1.0)))
     return A, B, C, D
@@ -120,58 +123,60 @@ class Gaussian:
     n over the object distance, 0 for an object at infinity. Source: Welford, Aberrations, ch. 3.
     """
 
-    A: object
-    B: object
-    C: object
-    D: object
-    front: tuple
-    from_stop: Callable[[], tuple]
-    n_object: object
-    n_image: object
+    A: Number
+    B: Number
+    C: Number
+    D: Number
+    front: tuple[Number, Number]
+    from_stop: Callable[[], tuple[Number, Number]]
+    n_object: Number
+    n_image: Number
 
     @functools.cached_property
-    def rear(self) -> tuple:
+    def rear(self) -> tuple[Number, Number]:
         """B and D from the stop to behind the last surface before the image."""
         return self.from_stop()
 
     @property
-    def effective_focal_length(self):
+    def effective_focal_length(self) -> Number:
         return quotient(-abs(self.n_image), self.C)
 
     @property
-    def entrance_pupil_position(self):
+    def entrance_pupil_position(self) -> Number:
         """mm from surface 1."""
         return self.n_object * self.front[1] / self.front[0]
 
     @property
-    def exit_pupil_distance(self):
+    def exit_pupil_distance(self) -> Number:
         """mm from the last surface before the image."""
         return quotient(-self.n_image * self.rear[0], self.rear[1])
 
     @property
-    def pupil_magnification(self):
+    def pupil_magnification(self) -> Number:
         """Diameter of the exit pupil over that of the entrance pupil."""
         return abs(quotient(self.front[0], self.rear[1]))
 
     @property
-    def angular_magnification(self):
+    def angular_magnification(self) -> Number:
         return quotient(self.n_object * self.rear[1], self.n_image * self.front[0])
 
-    def omega_behind(self, vergence):
+    def omega_behind(self, vergence: Number) -> Number:
         """ω′ per mm of height at surface 1 of an axial ray."""
         return self.C + self.D * vergence
 
-    def image_distance(self, vergence):
+    def image_distance(self, vergence: Number) -> Number:
         return quotient(-self.n_image * (self.A + self.B * vergence), self.omega_behind(vergence))
 
-    def magnification(self, vergence):
+    def magnification(self, vergence: Number) -> Number:
         return quotient(vergence, self.omega_behind(vergence))
 
-    def pupil_reach(self, vergence):
+    def pupil_reach(self, vergence: Number) -> Number:
         """Height of an axial ray in the entrance pupil per mm of height at surface 1."""
         return 1 + self.entrance_pupil_position * vergence / self.n_object
 
-    def entrance_pupil_diameter(self, kind: str, number, distance, vergence, tan_cone):
+    def entrance_pupil_diameter(
+        self, kind: str, number: Number, distance: Number, vergence: Number, tan_cone: Number
+    ) -> Number:
         """The diameter in mm that an aperture means; distance: mm, of the object; tan_cone: of its half angle there."""
         if kind == "entrance_pupil_diameter":
             return number
@@ -184,7 +189,9 @@ class Gaussian:
             return 2 * abs(slope * self.n_image / self.omega_behind(vergence) * self.pupil_reach(vergence))
         return 2 * abs((distance + self.entrance_pupil_position) * tan_cone)
 
-    def marginal_height(self, kind: str, diameter, distance, vergence, tan_cone):
+    def marginal_height(
+        self, kind: str, diameter: Number, distance: Number, vergence: Number, tan_cone: Number
+    ) -> Number:
         """Height in mm at surface 1 of the ray from the axial object point through the edge of the entrance pupil.
 
         The cone of an object NA or angle needs no pupil, which may lie at infinity.
@@ -200,7 +207,9 @@ class Gaussian:
 CONES = "object_na", "object_cone_angle"
 
 
-def field_scale(kind: str, *, at_infinity: bool, distance, entrance_pupil, power, magnification):
+def field_scale(
+    kind: str, *, at_infinity: bool, distance: Number, entrance_pupil: Number, power: Number, magnification: Number
+) -> Number:
     """Slope of the chief ray at the object, or object height in mm, per tan θ or per mm of a field of some kind.
 
     kind: of `Fields`; power: -C/n of the object space, for an object at infinity; magnification: for a finite one.
@@ -212,7 +221,9 @@ def field_scale(kind: str, *, at_infinity: bool, distance, entrance_pupil, power
     return power if at_infinity else 1 / magnification
 
 
-def chief_ray(extent, *, at_infinity: bool, distance, entrance_pupil, parallel: bool) -> tuple:
+def chief_ray(
+    extent: Number, *, at_infinity: bool, distance: Number, entrance_pupil: Number, parallel: bool
+) -> tuple[Number, Number]:
     """(ȳ, ū) before surface 1 of a field whose extent is a slope, or an object height in mm.
 
     parallel: the entrance pupil of a finite object is at infinity.
@@ -225,7 +236,7 @@ def chief_ray(extent, *, at_infinity: bool, distance, entrance_pupil, parallel: 
     return -entrance_pupil * slope, slope
 
 
-def petzval_sum(curvatures: Sequence, indices: Sequence):
+def petzval_sum(curvatures: Sequence[Number], indices: Sequence[Number]) -> Number:
     """Σ c (n′ - n)/(n n′) in 1/mm; indices: signed, one more than curvatures. Any number type."""
     pairs = zip(curvatures, indices[:-1], indices[1:], strict=True)
     return sum(c * ((behind - before) / (before * behind)) for c, before, behind in pairs)
@@ -235,30 +246,35 @@ def system_matrix(
     surfaces: Sequence[Surface],
     indices: Sequence[Tensor],
     wavelength: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> Matrix:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω from the first vertex, before it, to behind the last surface.
 
-    The axis is straightened: tilts, decentres and the mean slope of a grating are left out, and what bends differently
-    along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
-    µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
+    The axis is straightened: tilts, decentres and the mean slope of a grating are ignored, and a surface of different
+    powers along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength:
+    (...) µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
     powers, gaps = _powers_and_gaps(surfaces, indices, wavelength)
     return _matrices(powers, gaps[:-1], indices[0], -1)[0]
 
 
-def _powers_and_gaps(surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None) -> tuple:
+def _powers_and_gaps(
+    surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None
+) -> tuple[list[Tensor], list[Tensor]]:
     """Powers in 1/mm of surfaces, and t/n behind each."""
     pairs = zip(surfaces, indices[:-1], indices[1:], strict=True)
     gaps = [surface.thickness / n for surface, n in zip(surfaces, indices[1:], strict=True)]
     return [power(surface, before, behind, wavelength) for surface, before, behind in pairs], gaps
 
 
-def _matrices(powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor, *before: int) -> list[tuple[Tensor, ...]]:
+def _matrices(powers: Sequence[Tensor], gaps: Sequence[Tensor], like: Tensor, *before: int) -> list[Matrix]:
     """(A, B, C, D) up to before some surfaces, from 0, -1 behind the last one: `ynu` of two rays at once."""
     axes = max(number.dim() for number in (like, *powers, *gaps))
-    y, one = like.new_tensor([1.0, 0.0]).reshape(2, *[1] * axes), torch.ones_like(like)
-    rays = ynu(y, y.flip(0), powers, gaps)
-    return [(*(one * rays[k][0]).unbind(0), *(one * rays[k][1]).unbind(0)) for k in before]
+    y, ones = like.new_tensor([1.0, 0.0]).reshape(2, *[1] * axes), torch.ones_like(like)
+    rays, matrices = ynu(y, y.flip(0), powers, gaps), []
+    for k in before:
+        (A, B), (C, D) = (ones * part for part in rays[k])
+        matrices.append((A, B, C, D))
+    return matrices
 
 
 def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
@@ -270,8 +286,8 @@ def gaussian(lens: Lens, n: Sequence[Tensor], wavelength: Tensor) -> Gaussian:
         ((_, B, _, D),) = _matrices(powers[stop:], gaps[stop:-1], n[0], -1)
         return B, D
 
-    whole, front = _matrices(powers, gaps[:-1], n[0], -1, stop)
-    return Gaussian(*whole, front[:2], from_stop, n[0], n[-1])
+    (A, B, C, D), front = _matrices(powers, gaps[:-1], n[0], -1, stop)
+    return Gaussian(A, B, C, D, front[:2], from_stop, n[0], n[-1])
 
 
 @value
@@ -321,7 +337,7 @@ def axial_beam(lens: Lens, wavelength: Tensor | None = None) -> Beam:
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     """First-order data; wavelength: (...) µm, the primary one by default. Source: Welford, Aberrations, ch. 3.
 
-    A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
+    A quantity that does not exist, such as the focal length of an afocal lens, is infinite.
     """
     wavelength = lens.primary if wavelength is None else wavelength
     beam = axial_beam(lens, wavelength)
@@ -371,15 +387,15 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
 
 
 def object_distance_of(lens: Lens) -> Tensor:
-    """The distance (...) mm of the object; of one at surface 1 so little that all is what it is in the limit."""
+    """The distance (...) mm of the object; for an object at surface 1 the smallest one that can be divided by."""
     distance = lens.surfaces[0].thickness
     return torch.where(distance == 0, torch.finfo(distance.dtype).tiny ** 0.5, distance)
 
 
 def largest_field(lens: Lens) -> Tensor:
-    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit.
+    """The field point (2, 1) along y at the distance of the lens's outermost field point from the axis, in its unit.
 
-    Where not every surface is round about one axis it is the outermost itself: directions are not alike.
+    In a lens without rotational symmetry it is the outermost field point itself.
     """
     if is_round_about_axis(lens):
         extent = lens.fields.extent
@@ -404,7 +420,7 @@ def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Ten
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
-    """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+    """Half angle of the cone at the object, radians, of an aperture given as object NA or cone angle."""
     kind, number = lens.aperture.kind, lens.aperture.value
     return torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
 

@@ -33,19 +33,19 @@ _RINGS = 8  # of the rays that try a field
 
 
 class LostRays(RaytraceWarning):
-    """Rays do not reach the sensor; the message says which, where they end and what helps."""
+    """Rays do not reach the sensor; the message has their field, the surfaces where they end and a remedy."""
 
 
 class OutOfReach(RaytraceError, ValueError):
-    """No ray of a field reaches the sensor; the message says where they end and what helps."""
+    """No ray of a field reaches the sensor; the message has the surfaces where they end and a remedy."""
 
 
 @value
 class Losses:
     """Number of rays that end at every surface, by their first failure.
 
-    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) not launched, for no
-    ray through their pupil point was found; launched: number of each field and wavelength.
+    lost: (3, K, F, W) missed, totally reflected and vignetted at surface k + 1; unaimed: (F, W) not launched, because
+    ray aiming failed; launched: number of each field and wavelength.
     """
 
     lost: Tensor
@@ -110,29 +110,29 @@ def warn_of_failures(
     fields: Tensor,
     wavelengths: Tensor | None = None,
     ray_aiming: str | None = None,
-    at: str = "",
+    prefix: str = "",
 ) -> None:
-    """Warn LostRays for every field that loses all its rays at a wavelength, where and why; and of too wide a beam.
+    """Warn LostRays, with causes, of every field whose rays all fail at a wavelength; and of too wide a beam.
 
     pupil: (2, P), through which rays are traced once more; dark: (F, W), which of the fields (2, F) and wavelengths
-    (W,), the lens's by default; at: prefix of the message, as the object distance.
+    (W,), the lens's by default; prefix: of the message, as the object distance.
     """
     if not bool(dark.any()):
         return
     if dark.dim() > 2:  # of a batch: the first lens that loses a field
         of_lens = dark.any(-1).any(-1)
         first, several = int(of_lens.int().argmax()), f"{int(of_lens.sum())} of {len(of_lens)} lenses"
-        lens, dark, at = one_lens(lens, first), dark[first], f"{at}lens {first} ({several} lose fields): "
+        lens, dark, prefix = one_lens(lens, first), dark[first], f"{prefix}lens {first} ({several} lose fields): "
     some = dark.any(1)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
+    losses = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
     for place, (field, lost) in enumerate(zip(fields[:, some].unbind(1), dark[some].tolist(), strict=True)):
         wavelengths_of: dict[str, list[str]] = {}
         for w, wavelength in enumerate(wavelengths.tolist()):
             if lost[w]:
-                wavelengths_of.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
+                wavelengths_of.setdefault(losses.words(place, w), []).append(f"{wavelength:g}")
         for words, colours in wavelengths_of.items():
-            _warn(f"{at}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
+            _warn(f"{prefix}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
         _warn(f"{hint}; see {option('f_number')} and {option('entrance_pupil_diameter')}")
 
@@ -155,10 +155,10 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
         dark = (~arrives.any(-1)[:, 0]).nonzero()[:, 0].tolist()
         if not dark:
             return
-        found = ray_failures(lens, pupil, fields=tried[:, dark], wavelengths=primary)
+        losses = ray_failures(lens, pupil, fields=tried[:, dark], wavelengths=primary)
     names, help_words = [_named(lens, tried[:, f]) for f in dark], _help(lens, fields)
     messages = [
-        f"no ray of field {name} reaches the sensor: {found.words(place, 0)}; {help_words}"
+        f"no ray of field {name} reaches the sensor: {losses.words(place, 0)}; {help_words}"
         for place, name in enumerate(names)
     ]
     if every or len(dark) == tried.shape[1]:
@@ -173,10 +173,12 @@ def _help(lens: Lens, fields: Tensor | None) -> str:
     if fields is not None:
         largest = float(lens.fields.extent)
         return (
-            f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give {option('fields')} within"
+            f"the fields of the lens reach {largest:g} {FIELD_UNITS[lens.fields.kind]}, give {option('fields')} within"
         )
-    smaller_beam = f"{option('f_number')} or {option('entrance_pupil_diameter')}"
-    return f"give other fields by {option('fields')}, a smaller beam by {smaller_beam}"
+    return (
+        f"give other fields by {option('fields')}, a smaller beam by {option('f_number')} or "
+        f"{option('entrance_pupil_diameter')}"
+    )
 
 
 def beam_hint(lens: Lens) -> str:
@@ -184,10 +186,10 @@ def beam_hint(lens: Lens) -> str:
     if lens.aperture.kind not in ("object_na", "object_cone_angle"):
         return ""
     number = float(lens.aperture.value)
-    what = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
+    cone = f"object NA of {number:g}" if lens.aperture.kind == "object_na" else f"object cone of ±{number:g} degrees"
     distance, diameter = float(lens.surfaces[0].thickness), float(axial_beam(lens).entrance_pupil_diameter)
     return (
-        f"the aperture is an {what}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
+        f"the aperture is an {cone}, whose entrance pupil is {diameter:.4g} mm wide for an object at {distance:g} mm; "
         "an F-number, an entrance pupil diameter or another aperture that the lens keeps would hold its beam"
     )
 

@@ -10,6 +10,7 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -48,9 +49,9 @@ class Traced(Rays, Result):
     that `trace` launched. Rays that could not be launched are not in the table.
     """
 
-    lens: Lens | None = None
-    launched: Rays | None = None
-    labels: Tensor | None = None
+    lens: Lens = dataclasses.field(kw_only=True)
+    launched: Rays = dataclasses.field(kw_only=True)
+    labels: Tensor | None = dataclasses.field(kw_only=True)
 
     @property
     def count(self) -> int:
@@ -117,15 +118,14 @@ class Traced(Rays, Result):
 
     def of_lens(self, number: int) -> "Traced":
         """The rays of one lens of a batch."""
-        parts = (self.position, self.direction, self.launched.position, self.launched.direction)
-        position, direction, *start = (part[:, number] for part in parts)
-        path, launched_path = (
-            rays.opl if rays.opl is None else rays.opl.expand(rays.shape)[number] for rays in (self, self.launched)
-        )
-        launched = Rays(*start, self.launched.valid[number], launched_path, self.launched.wavelength)
+
+        def ends(rays: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+            path = rays.opl if rays.opl is None else rays.opl.expand(rays.shape)[number]
+            return rays.position[:, number], rays.direction[:, number], rays.valid[number], path, rays.wavelength
+
         labels = None if self.labels is None else self.labels[:, number]
-        ends = position, direction, self.valid[number], path, self.wavelength
-        return Traced(*ends, one_lens(self.lens, number), launched, labels)
+        launched = Rays(*ends(self.launched))
+        return Traced(*ends(self), lens=one_lens(self.lens, number), launched=launched, labels=labels)
 
     def _parts(self) -> Iterator[dict[str, Tensor]]:
         """The columns of the table in chunks of _BATCH rays; of a batch with the number of the lens."""
@@ -151,6 +151,7 @@ class Traced(Rays, Result):
                 yield from self.of_lens(number)._ways()
             return
         rays, valid = self.launched, self.launched.valid.flatten()
+        assert rays.wavelength is not None  # as `trace` gives it
         opl = torch.zeros_like(rays.position[0]) if rays.opl is None else rays.opl
         opl, wavelength = (t.detach().expand(rays.shape).flatten()[valid] for t in (opl, rays.wavelength))
         position, direction = (t.detach().reshape(3, -1)[:, valid] for t in (rays.position, rays.direction))
@@ -187,30 +188,38 @@ def trace(
             message = f"{placed} change nothing: a table defines where its rays start"
             warnings.warn(message, ChangesNothing, stacklevel=calling_level())
         launched = rays if isinstance(rays, Rays) else read_rays(rays, lens)
-    if launched.wavelength is None:
-        given = lens.primary if wavelengths is None else wavelengths_of(lens, wavelengths)
-        launched = dataclasses.replace(launched, wavelength=given.squeeze())
-    end = trace_lens(lens, launched, launched.wavelength)
-    return Traced(end.position, end.direction, end.valid, end.opl, launched.wavelength, lens, launched, labels)
+    wavelength = launched.wavelength
+    if wavelength is None:
+        wavelength = (lens.primary if wavelengths is None else wavelengths_of(lens, wavelengths)).squeeze()
+        launched = dataclasses.replace(launched, wavelength=wavelength)
+    end = trace_lens(lens, launched, wavelength)
+    ends = end.position, end.direction, end.valid, end.opl, wavelength
+    return Traced(*ends, lens=lens, launched=launched, labels=labels)
 
 
-def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_aiming) -> tuple[Rays, Tensor]:
+def _chief_and_marginal(
+    lens: Lens,
+    object_distances: Sequence[float] | Tensor | None,
+    fields: Tensor | Sequence | None,
+    wavelengths: Tensor | Sequence[float] | None,
+    ray_aiming: str | None,
+) -> tuple[Rays, Tensor]:
     pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
     fields = field_points(fields, like=lens)
     wavelengths = lens.primary[None] if wavelengths is None else wavelengths_of(lens, wavelengths)
     warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     distance = lens.surfaces[0].thickness
-    how = {"fields": fields, "pupil": pupil, "wavelengths": wavelengths, "ray_aiming": ray_aiming}
+    launch = partial(launched, fields=fields, pupil=pupil, wavelengths=wavelengths, ray_aiming=ray_aiming)
     if object_distances is None:
-        rays = launched(lens, **how)
+        rays = launch(lens)
     else:
         distance = vector(object_distances, like=lens).reshape(-1, 1, 1, 1)
-        each = [launched(lens.at(object_distance=d), **how) for d in distance.flatten()]
+        each = [launch(lens.at(object_distance=d)) for d in distance.flatten()]
         rays = Rays(
             torch.stack([rays.position for rays in each], 1),
             torch.stack([rays.direction for rays in each], 1),
             torch.stack([rays.valid for rays in each]),
-            torch.stack([rays.opl for rays in each]),
+            torch.stack([rays.opl for rays in each if rays.opl is not None]),
             wavelengths[:, None],
         )
     if unaimed := int((~rays.valid).sum()):
@@ -237,6 +246,7 @@ def _way(lens: Lens, rays: Rays, wavelength: Tensor) -> _Way:
         vignetted = vignetted | crossing.clipped
         state = torch.where(vignetted, _VIGNETTED, _OK)
         state = torch.where(crossing.totally_reflected, _TIR, torch.where(crossing.missed, _MISS, state))
+        assert crossing.rays.opl is not None  # as the rays start with paths
         path = crossing.rays.opl + axial_path(surfaces[:k], indices[: k + 1])
         stopped = crossing.missed | crossing.totally_reflected
         shown.append(~ended)

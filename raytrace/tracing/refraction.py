@@ -18,14 +18,22 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import dot, to
-from raytrace.system.intersection import normal
-from raytrace.system.phases import Added, added_path, ideal_path, kind_of, path_of
+from raytrace.system.intersection import Meeting, normal
+from raytrace.system.phases import Added, IdealLens, added_path, ideal_path, kind_of, path_of
 from raytrace.system.surface import SHAPE, Surface
 
 Vector = Sequence[Tensor]
 
 
-def refract(direction: Vector, normal: Vector, cosine, norm_squared, n1, n2, b_squared: Tensor | None = None):
+def refract(
+    direction: Vector,
+    normal: Vector,
+    cosine: Tensor,
+    norm_squared: Tensor | float,
+    n1: Tensor,
+    n2: Tensor,
+    b_squared: Tensor | None = None,
+) -> tuple[list[Tensor], Tensor]:
     """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
 
         d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
@@ -44,15 +52,24 @@ def refract(direction: Vector, normal: Vector, cosine, norm_squared, n1, n2, b_s
     return _renormalise(refracted), passes
 
 
-def reflect(direction: Vector, normal: Vector, cosine, norm_squared) -> list[Tensor]:
+def reflect(direction: Vector, normal: Vector, cosine: Tensor, norm_squared: Tensor | float) -> list[Tensor]:
     """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
     twice = 2 * cosine / norm_squared
     return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
 
 
 def diffract(
-    direction: Vector, normal: Vector, cosine, norm_squared, n1, n2, added: Added, *, mirror: bool, b_squared=None
-):
+    direction: Vector,
+    normal: Vector,
+    cosine: Tensor,
+    norm_squared: Tensor | float,
+    n1: Tensor,
+    n2: Tensor,
+    added: Added,
+    *,
+    mirror: bool,
+    b_squared: Tensor | None = None,
+) -> tuple[list[Tensor], Tensor]:
     """Refraction or reflection with the gradient of an added path, and whether light passes: see the module."""
     L, M, N = direction
     q = n1 * L + added.x, n1 * M + added.y, n1 * N
@@ -64,17 +81,21 @@ def diffract(
     same_sign = a * b > 0
     along = torch.where(same_sign, D / torch.where(same_sign, a + b, 1.0), (b - a) / norm_squared)
     n2 = torch.where(n2 > 0, n2, 1.0)
-    return _renormalise([torch.addcmul(at, along, n) / n2 for at, n in zip(q, normal, strict=True)]), passes
+    return _renormalise([torch.addcmul(along_q, along, n) / n2 for along_q, n in zip(q, normal, strict=True)]), passes
 
 
-def _grating_equation(direction: Vector, normal: Vector, cosine, n1, n2, added: Added) -> tuple[Tensor, Tensor]:
+def _grating_equation(
+    direction: Vector, normal: Vector, cosine: Tensor, n1: Tensor, n2: Tensor, added: Added
+) -> tuple[Tensor, Tensor]:
     """a and D of the module's equation."""
     L, M, _ = direction
     a = torch.addcmul(n1 * cosine + added.x * normal[0], added.y, normal[1])
     return a, (n2 - n1) * (n2 + n1) - (added.x * (2 * n1 * L + added.x) + added.y * (2 * n1 * M + added.y))
 
 
-def bend_slopes(direction: Vector, height: Vector, power: tuple[Tensor, Tensor], n1, n2) -> list[Tensor]:
+def bend_slopes(
+    direction: Vector, height: Vector, power: tuple[Tensor, Tensor], n1: Tensor, n2: Tensor
+) -> list[Tensor]:
     """Ideal lens, n2 tan θ2 = n1 tan θ1 - power · height in x and y, with -n for n where light travels backward.
 
         d' ∝ (n1 L - φx x |N|, n1 M - φy y |N|, n2 N)
@@ -88,7 +109,9 @@ def bend_slopes(direction: Vector, height: Vector, power: tuple[Tensor, Tensor],
     return [component * factor for component in bent]
 
 
-def deflect(surface: Surface, meeting, direction: Vector, n1, n2, wavelength: Tensor | None):
+def deflect(
+    surface: Surface, meeting: Meeting, direction: Vector, n1: Tensor, n2: Tensor, wavelength: Tensor | None
+) -> tuple[Vector, Tensor | None, Tensor | None]:
     """Direction behind a surface, whether light passes (None: always), and the path that a phase adds (None: none).
 
     meeting: `intersection.Meeting` of the rays. If n2 is the same tensor as n1, a surface without a phase is a dummy
@@ -97,28 +120,30 @@ def deflect(surface: Surface, meeting, direction: Vector, n1, n2, wavelength: Te
     hit, cosine, phase, mirror = meeting.hit, meeting.cosine, surface.phase, surface.is_mirror
     if phase is None and not mirror and n2 is n1:
         return direction, None, None
-    kind = None if phase is None else kind_of(phase)
-    if kind is not None and kind.slopes:
-        behind = bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2)
+    if isinstance(phase, IdealLens):
+        behind = bend_slopes(direction, hit, (phase.power_x, phase.power_y), n1, n2)
         return behind, None, ideal_path(phase, hit, direction, behind, n1, n2)
     n, norm_squared = normal(surface, hit) if meeting.normal is None else meeting.normal
     exact = meeting.exact
-    if kind is None or kind.flat:
-        if kind is not None:  # the facets of a Fresnel lens: `cosine` is that of the plane
+    if phase is None or kind_of(phase).flat:
+        if phase is not None:  # the facets of a Fresnel lens: `cosine` is that of the plane
             cosine, exact = dot(n, direction), None
         if mirror:
             return reflect(direction, n, cosine, norm_squared), None, None
-        b_squared = None if exact is None else _exact_root(surface, *exact, n1, n2)
+        b_squared = None if exact is None else _exact_root(surface, exact, n1, n2)
         return *refract(direction, n, cosine, norm_squared, n1, n2, b_squared), None
     added = added_path(phase, hit[0], hit[1], wavelength)
-    b_squared = None if exact is None else _exact_root(surface, *exact, n1, n2, wavelength)
+    b_squared = None if exact is None else _exact_root(surface, exact, n1, n2, wavelength)
     direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror, b_squared=b_squared)
     return direction, passes, added.path
 
 
 @torch.no_grad()
-def _exact_root(surface: Surface, hit: Vector, direction: Vector, n1, n2, wavelength: Tensor | None = None) -> Tensor:
-    """b² in float64, outside the graph, with the phase's numbers at the precision of the rays."""
+def _exact_root(
+    surface: Surface, exact: tuple[Vector, Vector], n1: Tensor, n2: Tensor, wavelength: Tensor | None = None
+) -> Tensor:
+    """b² in float64, outside the graph, with the phase's numbers at the precision of the rays; exact: of `Meeting`."""
+    hit, direction = exact
     shape = {name: to(getattr(surface, name), dtype=torch.float64) for name in SHAPE}
     n, norm_squared = normal(dataclasses.replace(surface, **shape), hit)
     if surface.phase is None or kind_of(surface.phase).flat:

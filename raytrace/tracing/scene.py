@@ -37,8 +37,8 @@ Bundle = tuple[Lens, Tensor, Tensor, Tensor]
 class _Front:
     """Rays behind the first `count` surfaces after the object, in the frame of the last of them (of surface 1 if 0).
 
-    points: (2, ...) mm where they meet the surfaces that are asked for among these; indices: of all media, None if one
-    depends on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
+    points: (2, ...) mm where they meet the requested surfaces among these; indices: of all media, None if one depends
+    on a variable; smooth: whether polynomials in 1/distance reproduce the rays.
     """
 
     count: int
@@ -100,7 +100,7 @@ class Memo:
     def front(self, bundle: Bundle, numbers: tuple[int, ...] | None = None) -> _Front:
         """The rays in front of the first surface that depends on a variable.
 
-        numbers: of surfaces at which their points are asked for; then they have no paths, and no aperture stops them.
+        numbers: of surfaces whose points are requested; then the rays have no paths, and no aperture stops them.
         """
         distance, pupil = bundle[0].surfaces[0].thickness, bundle[3]
         # Where rays fail, each object distance may have its own pupil points.
@@ -108,24 +108,24 @@ class Memo:
             low, high = self._range
             if bool(((distance >= low) & (distance <= high)).all()):
                 front = self._find_or_trace(_at_nodes(bundle, self._range), numbers, judge=_is_smooth)
-                if front.smooth:
+                if front.rays is not None and front.smooth:
                     near, far = 1 / low, 1 / high
                     weights = _series_weights((2 / distance.flatten() - (near + far)) / (near - far))
-                    return _at_distances(front, weights)
+                    return _at_distances(front, front.rays, weights)
         return self._find_or_trace(bundle, numbers, judge=lambda front: False)
 
     def _find_or_trace(
         self, bundle: Bundle, numbers: tuple[int, ...] | None, *, judge: Callable[[_Front], bool]
     ) -> _Front:
         leaves, structure = pytree.tree_flatten((bundle, numbers))
-        structure = (structure, tuple(None if isinstance(leaf, Tensor) else leaf for leaf in leaves))
+        key = structure, tuple(None if isinstance(leaf, Tensor) else leaf for leaf in leaves)
 
         def trace() -> _Front:
             front = _constant_front(bundle, numbers)
             self.crossed += front.count
             return dataclasses.replace(front, smooth=judge(front))
 
-        return self.find([leaf for leaf in leaves if isinstance(leaf, Tensor)], structure, trace)
+        return self.find([leaf for leaf in leaves if isinstance(leaf, Tensor)], key, trace)
 
 
 def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:
@@ -155,7 +155,7 @@ def points_of_bundle(bundle: Bundle, numbers: tuple[int, ...], memo: Memo | None
     left = numbers[len(front.points) :]
     trace = rays_at(lens, wavelength, left, first=done, indices=indices)
     each = trace(dataclasses.replace(rays, opl=None))
-    return [*front.points, *(at.position[:2] for at in each)], (each[-1] if each else rays).valid
+    return [*front.points, *(met.position[:2] for met in each)], (each[-1] if each else rays).valid
 
 
 def _launched(bundle: Bundle) -> Rays:
@@ -164,7 +164,7 @@ def _launched(bundle: Bundle) -> Rays:
 
 
 def _resumed(bundle: Bundle, front: _Front, memo: Memo) -> tuple[int, Rays, list[Tensor]]:
-    """Behind which surface the rays of a bundle go on, these rays, and the indices of all media."""
+    """The surface behind which the trace of a bundle resumes, its rays there, and the indices of all media."""
     lens, _, wavelength, _ = bundle
     memo.crossed += len(lens.surfaces) - 1 - front.count
     rays = _launched(bundle) if front.rays is None else front.rays
@@ -197,7 +197,7 @@ def _constant_front(bundle: Bundle, numbers: tuple[int, ...] | None) -> _Front:
             stops = dict.fromkeys([*passed, count])
             trace = rays_at(lens, wavelength, [*stops], indices=indices)
             each = trace(dataclasses.replace(rays, opl=None))
-            rays, points = each[-1], [at.position[:2] for at in each[: len(passed)]]
+            rays, points = each[-1], [met.position[:2] for met in each[: len(passed)]]
     return _Front(count, rays, points, constant_indices)
 
 
@@ -206,14 +206,14 @@ def _constant_front(bundle: Bundle, numbers: tuple[int, ...] | None) -> _Front:
 
 def _at_nodes(bundle: Bundle, ends: tuple[float, float]) -> Bundle:
     """The bundle at _NODES object distances (Chebyshev points of 1/distance) and, as a check, at as many between."""
-    lens, *others = bundle
+    lens, field, wavelength, pupil = bundle
     angle = math.pi / (2 * _NODES) * torch.cat([torch.arange(_NODES) * 2 + 1, torch.arange(_NODES) * 2 + 2])
     node = torch.cos(angle.to(torch.float64))
     near, far = 1 / ends[0], 1 / ends[1]
     distance = 1 / (0.5 * (near + far) + 0.5 * (near - far) * node)
     like = lens.surfaces[0].thickness
     distance = distance.to(dtype=like.dtype, device=like.device).reshape(-1, *(1,) * (like.dim() - 1))
-    return with_object_distance(lens, distance), *others
+    return with_object_distance(lens, distance), field, wavelength, pupil
 
 
 def _series_weights(x: Tensor) -> Tensor:
@@ -229,7 +229,7 @@ def _series_weights(x: Tensor) -> Tensor:
 
 def _is_smooth(front: _Front) -> bool:
     """Whether the polynomials reproduce the rays of the distances between the nodes."""
-    if front.count == 0 or front.rays.position.shape[1] != 2 * _NODES:
+    if front.rays is None or front.count == 0 or front.rays.position.shape[1] != 2 * _NODES:
         return False
     valid = front.rays.valid.expand(front.rays.shape)
     if not torch.equal(valid, valid[:1].expand_as(valid)):
@@ -238,15 +238,15 @@ def _is_smooth(front: _Front) -> bool:
     interpolated = _combined(front.rays, _series_weights(between.to(front.rays.position)))
     traced = _part(front.rays, slice(_NODES, None))
     pairs = [(interpolated.position, traced.position), (interpolated.direction, traced.direction)]
-    pairs += [] if traced.opl is None else [(interpolated.opl, traced.opl)]
+    pairs += [] if interpolated.opl is None or traced.opl is None else [(interpolated.opl, traced.opl)]
     tolerance = _CLOSE if front.rays.position.dtype == torch.float64 else 1e-4
     return all(float((a - b).abs().max()) <= tolerance for a, b in pairs)
 
 
-def _at_distances(front: _Front, weights: Tensor) -> _Front:
-    """The front of a range of object distances at those of the weights (D, K)."""
-    points = [_sum_of_nodes(at, weights) for at in front.points]
-    return dataclasses.replace(front, rays=_combined(front.rays, weights), points=points)
+def _at_distances(front: _Front, rays: Rays, weights: Tensor) -> _Front:
+    """The front, with its rays, of a range of object distances at those of the weights (D, K)."""
+    points = [_sum_of_nodes(point, weights) for point in front.points]
+    return dataclasses.replace(front, rays=_combined(rays, weights), points=points)
 
 
 def _part(rays: Rays, rows: slice) -> Rays:
@@ -334,9 +334,9 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
     shape = (*scene.shape, disc.shape[-1])
     numbers = [k for k, surface in enumerate(scene.lens.surfaces) if k and surface.apertures]
     hits, met = points_of_bundle(_bundle(scene, disc), (*numbers, len(scene.lens.surfaces) - 1), scene.memo)
-    *crossed, hit = (at.expand(2, *shape) for at in hits)
-    pairs = zip(numbers, crossed, strict=True)
-    return hit, [(a, at) for k, at in pairs for a in scene.lens.surfaces[k].apertures], met.expand(shape)
+    *crossings, image = (hit.expand(2, *shape) for hit in hits)
+    pairs = zip(numbers, crossings, strict=True)
+    return image, [(a, hit) for k, hit in pairs for a in scene.lens.surfaces[k].apertures], met.expand(shape)
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:

@@ -29,7 +29,7 @@ class Spot:
 
     centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about it, or about another point.
     mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
-    points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
+    points: (2, ..., P) and valid: (..., P) of the rays that were averaged; rays: number of valid ones.
 
     A spot that no weighted ray reaches is nan, with gradient 0: the sum with it is nan, the derivatives of the others
     are not. A merit that ignores it (`nansum`, a mask by `rays`) rewards the loss: constrain `rays`, add a penalty, or
@@ -64,8 +64,8 @@ def spot_of_points(
 ) -> Spot:
     """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot_of`.
 
-    One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
-    of one ray has radius 0 and gradient 0.
+    One point is subtracted before the mean is formed, so that a spot of 1 pm at 1 m from the axis loses no precision; a
+    spot of one ray has radius 0 and gradient 0.
     """
     shape = points.shape[1:]
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(shape)
@@ -76,8 +76,9 @@ def spot_of_points(
         around = itertools.repeat(None) if about is None else about.expand(2, *shape[:-1]).split(size, 1)
         parts = zip(points.split(size, 1), valid.expand(shape).split(size), weights.split(size), around, strict=False)
         each = zip(*(_statistics(*part) for part in parts), strict=True)
-        figures = [torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each)]
-    return Spot(*where_lit(*figures, empty=empty), points=points, valid=valid, rays=valid.sum(-1))
+        figures = tuple(torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each))
+    centroid, mean_square, rms, geometric = where_lit(*figures, empty=empty)
+    return Spot(centroid, mean_square, rms, geometric, points, valid, valid.sum(-1))
 
 
 def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | None) -> tuple[Tensor, ...]:
@@ -108,10 +109,10 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
     """The numbers (..., *lit.shape) of spots where light arrives; elsewhere nan with gradient 0.
 
-    empty: "nan", or "error": then EmptySpot is raised if a spot is dark. Raises ValueError for another word.
+    empty: "nan", or "error", which raises EmptySpot if a spot is dark. Raises ValueError for another word.
     """
     if empty not in ("nan", "error"):
-        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', what a spot without rays is")
+        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', the value of a spot without rays")
     if empty == "error" and not bool(lit.all()):
         first = tuple(torch.nonzero(~lit)[0].tolist())
         raise EmptySpot(
@@ -143,6 +144,9 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
 
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status
+
+#: Fields (2, F) and lenses of one trace.
+Chunk = tuple[Tensor, Lens]
 
 
 @value
@@ -188,7 +192,7 @@ def arrivals(
     *,
     fields: Tensor | None = None,
     ray_aiming: str | None = None,
-    progress: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter,
+    progress: Callable[[Sequence[Chunk]], Iterable[Chunk]] = iter,
 ) -> Arrivals:
     """Trace points (2, P) of the pupil and their weights (P,) to the sensor, as many fields at once as a chunk holds.
 
@@ -209,7 +213,7 @@ def arrivals(
         launched = launch(part, pupil, fields=some, ray_aiming=ray_aiming)
         launched = dataclasses.replace(launched, opl=None)
         rays = trace_lens(part, launched, lens.wavelengths[:, None])
-        on_sensor = rays, rays.valid, None
+        on_sensor: tuple[Rays, Tensor, Tensor | None] = rays, rays.valid, None
         if not bool(rays.valid.all()):  # the surface that ends a ray is looked for where one fails
             reached = launched.valid
             for crossing, status in ray_status(part, launched, lens.wavelengths[:, None]):
@@ -217,7 +221,7 @@ def arrivals(
                 on_sensor = crossing.rays, reached, status
         each.append(on_sensor)
 
-    def joined(parts: Sequence[Tensor]) -> Tensor:
+    def joined(parts: list[Tensor]) -> Tensor:
         rows = [parts[k : k + len(lenses)] for k in range(0, len(parts), len(lenses))]
         return _cat([_cat(row, -4) for row in rows], -3)
 
@@ -232,7 +236,7 @@ def arrivals(
     return Arrivals(rays, status, reached, weight, pupil, fields, lens.wavelengths)
 
 
-def _cat(parts: Sequence[Tensor], dim: int) -> Tensor:
+def _cat(parts: list[Tensor], dim: int) -> Tensor:
     return torch.cat(parts, dim) if len(parts) > 1 else parts[0]
 
 

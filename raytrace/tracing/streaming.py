@@ -6,7 +6,8 @@ and LeVeque 1979), pixels in float64, gradients. The size of a chunk changes a r
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,13 +42,12 @@ class Beam:
 
         position = place (1, p_x, p_y),   direction ∝ (slope (1, p_x, p_y), 1)
 
-    place: (3, 3) mm; slope: (2, 3), or None for a plane wave of one direction: (3,).
+    place: (3, 3) mm; slope: (2, 3), or of a plane wave its direction (3,).
     """
 
     place: Tensor
     valid: Tensor
-    slope: Tensor | None = None
-    direction: Tensor | None = None
+    slope: Tensor
 
 
 class Shot(NamedTuple):
@@ -103,16 +103,17 @@ def pupil_chunks(
     if sampling not in ("sobol", "random"):
         raise ValueError(f"sampling {sampling!r} cannot be continued from any number of points: use sobol or random")
     generator = torch.Generator().manual_seed(seed)
-    first, block, table, steps = 0, None, None, None
+    first, blocks = 0, dict[int, tuple[Tensor, Tensor]]()
     while first < rays:
         last = min((first // size + 1) * size, rays)
         last = cut if cut is not None and first < cut < last else last
         if sampling == "random":
             yield random(last - first, generator=generator, dtype=like.dtype, device=like.device)[0]
         else:
-            if block != first // _SOBOL_POINTS:
-                block = first // _SOBOL_POINTS
-                table, steps = _sobol_table(size, seed + block, like.device)
+            block = first // _SOBOL_POINTS
+            if block not in blocks:
+                blocks = {block: _sobol_table(size, seed + block, like.device)}
+            table, steps = blocks[block]
             base = first // size * size
             bits = table[:, first - base : last - base] ^ _sobol_place(base % _SOBOL_POINTS, steps, table)
             radius, angle = bits.to(like.dtype).mul_(2.0**-_SOBOL_BITS)
@@ -121,7 +122,7 @@ def pupil_chunks(
         first = last
 
 
-def _sobol_table(size: int, seed: int, device) -> tuple[Tensor, Tensor]:
+def _sobol_table(size: int, seed: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """The first `size` (a power of two) scrambled Sobol points as integers (2, size), and the steps between blocks.
 
     Point i is the shift ⊕ the direction numbers V_m of the bits m of its Gray code i ⊕ (i >> 1): linear over the bits
@@ -158,7 +159,7 @@ def shot(lens: Lens, field: Tensor, wavelength: Tensor, *, ray_aiming: str | Non
             torch.cat([f[:, :1], f[:, 1:] - f[:, :1]], 1)
             for f in (position, direction[:2] if plane else direction[:2] / direction[2])
         )
-        beam = Beam(place, valid, None if plane else slope, direction[:, 0] if plane else None)
+        beam = Beam(place, valid, direction[:, 0] if plane else slope)
         beam = to(beam, dtype=lens.surfaces[-2].thickness.dtype)
     return Shot(lens, field, wavelength, media(lens, wavelength), beam)
 
@@ -170,8 +171,8 @@ def start(shot: Shot, pupil: Tensor) -> Rays:
         return Rays(rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0])
     beam = shot.beam
     position = torch.addmm(beam.place[:, :1], beam.place[:, 1:], pupil)
-    if beam.slope is None:
-        direction = beam.direction[:, None].expand_as(position)
+    if beam.slope.dim() == 1:
+        direction = beam.slope[:, None].expand_as(position)
     else:
         x, y = torch.addmm(beam.slope[:, :1], beam.slope[:, 1:], pupil)
         N = torch.rsqrt(torch.addcmul(torch.addcmul(torch.ones_like(x), x, x), y, y))
@@ -186,7 +187,7 @@ def hits(shot: Shot, pupil: Tensor) -> tuple[Tensor, Tensor]:
     return rays.position[:2], rays.valid
 
 
-def chunk_size(shot: Shot, max_bytes: int, *, kept: int = 0, recorded: bool = False) -> int:
+def chunk_size(shot: Shot, max_bytes: float, *, kept: int = 0, recorded: bool = False) -> int:
     """Rays of a chunk, a power of two, whose temporaries stay within max_bytes less those `kept` for results.
 
     recorded: whether a graph is recorded. Raises ValueError for fewer than 256 rays.
@@ -261,7 +262,7 @@ class _Far(NamedTuple):
         return _Far(self.reference, torch.where(farther, point, self.point), torch.where(farther, square, self.square))
 
 
-def stream_spot(lens: Lens, rays: int, **conditions) -> StreamedSpot:
+def stream_spot(lens: Lens, rays: int, **conditions: Any) -> StreamedSpot:
     """Spot (F, W) of that many rays for each field and wavelength; conditions: as for `stream_spots`."""
     return stream_spots(lens, rays, **conditions)[0]
 
@@ -291,10 +292,10 @@ def stream_spots(
     shots, shape, weights = shots_of(lens, rays, fields, wavelengths, wavelength_weights, ray_aiming)
     like = lens.surfaces[-2].thickness
     size = chunk_size(shots[0], max_bytes)
-    points = {"sampling": sampling, "seed": seed, "like": like}
+    chunks = partial(pupil_chunks, size=size, sampling=sampling, seed=seed, like=like)
     # The centroids of the first rays: of every shot, and of all wavelengths of its field.
     first, axis = [nothing(like)] * len(shots), like.new_zeros(2)
-    for part in pupil_chunks(min(rays, _PILOT), size, **points):
+    for part in chunks(min(rays, _PILOT)):
         first = [merge(m, moments(*hits(s, part), axis)) for m, s in zip(first, shots, strict=True)]
     joint = _of_colours(stacked(first, shape), weights).mean
     references = [(m.mean.to(like.dtype), joint[:, k // shape[1]].to(like.dtype)) for k, m in enumerate(first)]
@@ -303,7 +304,7 @@ def stream_spots(
     if rim:
         edge = with_rim(like.new_zeros(2, 0), like.new_zeros(0), rim)[0]
         far = [[farthest.or_of(*hits(s, edge)) for farthest in both] for s, both in zip(shots, far, strict=True)]
-    for part in pupil_chunks(rays, size, **points):
+    for part in chunks(rays):
         for k, s in enumerate(shots):
             landing, valid = hits(s, part)
             sums[k] = merge(sums[k], moments(landing, valid, far[k][0].reference))
@@ -366,7 +367,8 @@ def _spot(
     if joint:
         reference, radius, bound = reference[..., 0], radius.amax(-1), bound.amax(-1)
     figures = reference + m.mean, covariance, square, safe_sqrt(square), radius, bound
-    return StreamedSpot(*where_lit(m.count > 0, *figures, empty=empty), rays, launched)
+    centroid, covariance, square, rms, radius, bound = where_lit(m.count > 0, *figures, empty=empty)
+    return StreamedSpot(centroid, covariance, square, rms, radius, bound, rays, launched)
 
 
 def stream_gradient(
@@ -444,5 +446,5 @@ def mean_square_gradient(
                 progress(points.shape[1] * len(shots))
 
     total, slopes = stream_gradient(merit, list(cut.values()), chunks())
-    slopes = torch.autograd.grad(list(seen.values()), leaves, slopes, allow_unused=True)
-    return total * whole, [torch.zeros_like(t) if g is None else g for t, g in zip(leaves, slopes, strict=True)]
+    gradients = torch.autograd.grad(list(seen.values()), leaves, slopes, allow_unused=True)
+    return total * whole, [torch.zeros_like(t) if g is None else g for t, g in zip(leaves, gradients, strict=True)]

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
 from raytrace.tracing.compiled import (
+    Changes,
     Pushed,
     Task,
     forward,
@@ -56,6 +57,15 @@ class Crossing:
     missed: Tensor
     totally_reflected: Tensor
     clipped: Tensor
+
+
+class Passage(TypedDict):
+    """Options of `steps` and `trace_surfaces` for one run of surfaces."""
+
+    indices: Sequence[Tensor]
+    wavelength: Tensor | None
+    side: int
+    gap: Tensor | Gap | None
 
 
 class _Ray(NamedTuple):
@@ -103,8 +113,19 @@ def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, cle
     )
 
 
-def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None):
-    """Rays behind the surface, and whether those before it meet it, are not totally reflected, pass its apertures."""
+#: Rays behind a surface, and whether those before it meet it, are not totally reflected, pass its apertures.
+_Crossed = tuple[_Ray, Tensor, Tensor | None, Tensor | None]
+
+
+def _cross(
+    surface: Surface,
+    rays: _Ray,
+    gap: Tensor | Gap | None,
+    side: int,
+    n1: Tensor,
+    n2: Tensor,
+    wavelength: Tensor | None,
+) -> _Crossed:
     if isinstance(gap, Gap) or surface.before is not None or surface.is_break:
         rays, gap = _in_axes_of(surface, rays, gap, side, n1), None
         if surface.is_break:
@@ -121,7 +142,7 @@ def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor,
     clear = inside(surface.apertures, hit) if surface.apertures else None
     valid = rays.valid & survives
     after = _Ray(
-        position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],
+        position=[x if surface.is_plane and i == 2 else torch.where(survives, x, 0.0) for i, x in enumerate(hit)],
         direction=[torch.where(survives, d, axis) for d, axis in zip(direction, (0.0, 0.0, 1.0), strict=True)],
         valid=valid if clear is None else valid & clear,
         opl=opl if opl is None else torch.where(survives, opl, 0.0),
@@ -132,10 +153,9 @@ def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor,
 def _in_axes_of(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Ray:
     """Rays in the axes of the surface; their path less that of the axial ray in the gap, n1 T σ."""
     position, direction, opl = rays.position, rays.direction, rays.opl
-    thickness = gap
     if isinstance(gap, Gap):
         position, direction = point_in(gap.pose, position), direction_in(gap.pose, direction)
-        thickness = gap.thickness
+    thickness = gap.thickness if isinstance(gap, Gap) else gap
     if thickness is not None:
         x, y, z = position
         position = x, y, z - thickness
@@ -147,7 +167,9 @@ def _in_axes_of(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: in
     return _Ray(position, direction, rays.valid, opl)
 
 
-def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
+def _reduced_path(
+    start: Sequence[Tensor], hit: Sequence[Tensor], direction: Sequence[Tensor], gap: Tensor | None, side: int
+) -> Tensor:
     """Path from start (old frame) to hit (new frame) less the axial ray's T σ, without forming either.
 
     t - T σ = (hit - start)·d + T (N - σ),   N - σ = -σ (L² + M²)/(1 + σ N)
@@ -177,11 +199,20 @@ def steps(
     needed by surfaces with a phase; side: axial direction of light before surfaces[0] (-1 behind an odd number of
     mirrors).
     """
-    for before, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
+    for before, crossed in _walk(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap):
         yield _crossing(before, *crossed)
 
 
-def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], wavelength: Tensor | None, side, gap):
+def _walk(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None,
+    side: int,
+    gap: Tensor | Gap | None,
+) -> Iterator[tuple[_Ray, _Crossed]]:
+    """The rays before each surface in turn, and behind it."""
     before = _Ray.of(rays)
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
         crossed = _cross(surface, before, gap, side, n1, n2, wavelength)
@@ -208,19 +239,27 @@ def trace_surfaces(
     first = 0
     for expressible, run in itertools.groupby(surfaces, is_expressible):
         last = first + len(list(run))
-        arguments = {"indices": indices[first : last + 1], "wavelength": wavelength, "side": side, "gap": gap}
+        passage = Passage(indices=indices[first : last + 1], wavelength=wavelength, side=side, gap=gap)
         end = None
         if expressible and uses_compiled(rays, indices[first], last - first):
-            end = trace_compiled(surfaces[first:last], rays, **arguments, eager=_eager)
-        rays = _eager(surfaces[first:last], rays, **arguments) if end is None else end
+            end = trace_compiled(surfaces[first:last], rays, **passage, eager=_eager)
+        rays = _eager(surfaces[first:last], rays, **passage) if end is None else end
         side = side * side_behind(surfaces[first:last])
         gap, first = gap_behind(surfaces[last - 1]), last
     return rays
 
 
-def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None, side: int, gap) -> Rays:
+def _eager(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
+    side: int,
+    gap: Tensor | Gap | None,
+) -> Rays:
     after = None
-    for _, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
+    for _, crossed in _walk(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap):
         after = crossed[0]
     return rays if after is None else after.rays()
 
@@ -239,7 +278,7 @@ def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]
 
 
 def lens_task(lens: Lens, rays: Rays, wavelength: Tensor) -> Task | None:
-    """The surfaces and rays of `trace_lens` as the compiled trace takes them; None where it does not carry them."""
+    """The input of the compiled trace for `trace_lens`; None where it does not support these surfaces or rays."""
     surfaces = sequence_of(lens)
     if not all(map(is_expressible, surfaces)):
         return None
@@ -249,7 +288,7 @@ def lens_task(lens: Lens, rays: Rays, wavelength: Tensor) -> Task | None:
 def points_on_surfaces(lens: Lens, rays: Rays, wavelength: Tensor) -> Tensor | None:
     """Points (3, K, ...) mm of rays before surface 1 on the K surfaces after the object, each in its own axes.
 
-    By the compiled trace, without gradients; None where it does not carry these rays, or where one is lost.
+    By the compiled trace, without gradients; None where it does not support these rays, or where a ray fails.
     """
     surfaces, task = sequence_of(lens), lens_task(lens, rays, wavelength)
     if task is None or not _is_compiled(surfaces, task):
@@ -290,7 +329,7 @@ def sequence_of(lens: Lens) -> tuple[Surface, ...]:
 
 
 def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
+    """The points (2, ...) mm where rays in front of surface 1 meet the stop, and whether they do, vignetted or not."""
     (stop,), arrives = points_at(lens, wavelength, (lens.stop,))(rays)
     return stop, arrives
 
@@ -314,7 +353,7 @@ def points_at(lens: Lens, wavelength: Tensor, numbers: Sequence[int]) -> Callabl
 
     def points(rays: Rays) -> tuple[list[Tensor], Tensor]:
         *_, last = each = trace(dataclasses.replace(rays, opl=None))
-        return [at.position[:2] for at in each], last.valid
+        return [met.position[:2] for met in each], last.valid
 
     return points
 
@@ -322,23 +361,24 @@ def points_at(lens: Lens, wavelength: Tensor, numbers: Sequence[int]) -> Callabl
 def rays_at(
     lens: Lens, wavelength: Tensor, numbers: Sequence[int], *, first: int = 0, indices: Sequence[Tensor] | None = None
 ) -> Callable[[Rays], list[Rays]]:
-    """The map from rays to those behind each of the surfaces of these ascending numbers; apertures stop none.
+    """The map from rays to those behind each of the surfaces of these ascending numbers; no ray is vignetted.
 
     Surfaces and media are prepared once, for searches that trace many batches in turn. first: the surface that the rays
     are behind, 0 in front of surface 1; indices: of all media, computed by default.
     """
     indices = media(lens, wavelength) if indices is None else indices
-    surfaces, runs = (lens.surfaces[0], *_unclipped(sequence_of(lens))), []
+    surfaces = lens.surfaces[0], *_unclipped(sequence_of(lens))
+    runs: list[tuple[Sequence[Surface], Passage]] = []
     side = side_behind(surfaces[: first + 1])
     for last in numbers:
         run, gap = surfaces[first + 1 : last + 1], gap_behind(lens.surfaces[first]) if first else None
-        runs.append((run, {"indices": indices[first : last + 1], "side": side, "gap": gap, "wavelength": wavelength}))
+        runs.append((run, Passage(indices=indices[first : last + 1], wavelength=wavelength, side=side, gap=gap)))
         first, side = last, side * side_behind(run)
 
     def trace(rays: Rays) -> list[Rays]:
         each = []
-        for run, arguments in runs:
-            rays = trace_surfaces(run, rays, **arguments)
+        for run, passage in runs:
+            rays = trace_surfaces(run, rays, **passage)
             each.append(rays)
         return each
 
@@ -372,7 +412,7 @@ def aiming_of(lens: Lens) -> str:
 
 
 def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
-    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    """Whether these first surfaces of a lens bend its axis."""
     if any(map(is_posed, surfaces[1:])):
         return True
     if all(map(is_round, surfaces)):
@@ -391,7 +431,7 @@ def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
 
 
 class Bent(RaytraceError, ValueError):
-    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
+    """A quantity that needs a straight axis is requested of a lens whose axis bends; the message has the surface."""
 
 
 def need_axis(lens: Lens, what: str, instead: str = "") -> None:
@@ -412,9 +452,7 @@ def need_axis(lens: Lens, what: str, instead: str = "") -> None:
     raise Bent(f"{message}; {instead}" if instead else message)
 
 
-def pushed(
-    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
-) -> Pushed:
+def pushed(surfaces: Sequence[Surface], task: Task, changes: Tensor, start: Changes | None = None) -> Pushed:
     """`compiled.push` by the engine that is chosen; surfaces: those that the task was made of."""
     if _is_compiled(surfaces, task):
         return push(task, changes, start)
@@ -422,9 +460,9 @@ def pushed(
 
 
 def pushed_everywhere(
-    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
+    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: Changes | None = None
 ) -> Pushed | None:
-    """`compiled.push` behind every row where the compiled trace carries these rays; None where torch has to."""
+    """`compiled.push` behind every row; None where the compiled trace does not support these rays."""
     return push(task, changes, start, everywhere=True) if _is_compiled(surfaces, task) else None
 
 
@@ -438,26 +476,29 @@ def _is_compiled(surfaces: Sequence[Surface], task: Task) -> bool:
     return uses_compiled(Rays(position, direction, task.valid, opl), table, len(surfaces))
 
 
-def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
-    own, indices, gap = with_numbers(task.structure, surfaces, table, task.valid.shape[:-1])
-    return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
+def _behind(
+    surfaces: Sequence[Surface], task: Task, position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor
+) -> Rays:
+    rebuilt, indices, gap = with_numbers(task.structure, surfaces, table, task.valid.shape[:-1])
+    return trace_surfaces(rebuilt, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
 
 
-def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
+def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start: Changes | None) -> Pushed:
     """As `push`, by tensors that carry their derivatives."""
-    *rays, table = (None if part is None else part.detach() for part in task.inputs)
+    position, direction, opl, table = detached(task.inputs)
     if start is not None:
-        moved = start[0].movedim(1, 0), start[1].movedim(1, 0), start[2]
-        rays = [None if part is None else with_tangents(part, by) for part, by in zip(rays, moved, strict=True)]
+        by_position, by_direction, by_opl = start
+        position = with_tangents(position, by_position.movedim(1, 0))
+        direction = with_tangents(direction, by_direction.movedim(1, 0))
+        opl = opl if by_opl is None or opl is None else with_tangents(opl, by_opl)
     with torch.enable_grad():
-        end = _behind(surfaces, task, *rays, with_tangents(table, changes))
-    by_position, by_direction, by_opl = (
-        None if part is None else tangents_of(part, len(changes)) for part in (end.position, end.direction, end.opl)
-    )
+        end = _behind(surfaces, task, position, direction, opl, with_tangents(table, changes))
     return Pushed(
-        *(None if part is None else value_of(part) for part in (end.position, end.direction, end.opl)),
+        value_of(end.position),
+        value_of(end.direction),
+        None if end.opl is None else value_of(end.opl),
         end.valid,
-        by_position.movedim(0, 1),
-        by_direction.movedim(0, 1),
-        by_opl,
+        tangents_of(end.position, len(changes)).movedim(0, 1),
+        tangents_of(end.direction, len(changes)).movedim(0, 1),
+        None if end.opl is None else tangents_of(end.opl, len(changes)),
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
-from raytrace.maths.numerics import dot, root, safe_divide, safe_sqrt, unit, value
+from raytrace.maths.numerics import Number, dot, root, safe_divide, safe_sqrt, unit, value
 from raytrace.maths.sampling import gauss_rings
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays
@@ -33,7 +33,7 @@ class Wavefront:
         diffraction integral.
     energy: (D, F, W, P) share of the entrance pupil's light that each ray carries to the sensor; 0 if lost.
     landing: (2, D, F, W, P) mm, where rays meet the sensor, from the centre.
-    valid: (D, F, W, P) bool; usable: also rays that were only vignetted, whose numbers mean something still.
+    valid: (D, F, W, P) bool; usable: also rays that were only vignetted.
     pupil: (2, P) or (2, D, F, W, P) fractions of the entrance pupil before vignetting factors, Zernike's coordinates.
     weights: of the pupil points, mean over the disc.
     centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, along the chief
@@ -55,7 +55,7 @@ class Wavefront:
     index: Tensor
 
 
-def path_to_reference_sphere(rays, centre, curvature, index):
+def path_to_reference_sphere(rays: Number, centre: Number, curvature: Number, index: Number) -> Number:
     """Reduced path W (...) in mm of rays up to the reference sphere they are about to cross; OPD = W - W_chief.
 
         W = W_rays + n [ κ e²/(1 + √(1 - κ² e²)) - (P - Q)·d ],   e = |(P - Q) - ((P - Q)·d) d|
@@ -72,7 +72,7 @@ def path_to_reference_sphere(rays, centre, curvature, index):
     return rays.opl + index * (bend / (1 + root(1 - curvature * bend)) - along)
 
 
-def towards_centre(rays, centre, curvature):
+def towards_centre(rays: Number, centre: Number, curvature: Number) -> Number:
     """Unit vectors (3, ...) from where rays cross the reference sphere to its centre, (Q - q)/R.
 
     s = √(1 - κ² e²) d - κ e: the ray's own direction for a plane. Arguments as for `path_to_reference_sphere`.
@@ -140,7 +140,7 @@ def clear_wavefront(scene: Scene, rings: int, arms: int, *, reference: Tensor | 
 
 
 def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
-    """Rays of pupil points, the chief ray first, and which have numbers that mean something."""
+    """Rays of pupil points, the chief ray first, and which of them reach the sensor, vignetted or not."""
     rays = trace_scene(scene, with_chief)
     if is_bent(scene.lens):
         # Behind turned axes coordinates do not show which rays would arrive if nothing vignetted them.
@@ -150,7 +150,7 @@ def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
             unclipped = dataclasses.replace(scene, lens=without_apertures(scene.lens), memo=None)
             return rays, rays.valid | trace_scene(unclipped, with_chief).valid
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
-    # A chief ray along the axis has the numbers of a lost ray, and means them.
+    # A chief ray along the axis has the numbers of a failed ray, but is valid.
     on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
     return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
 
@@ -188,21 +188,16 @@ def _from_bent_pupil(scene: Scene, centre: Tensor, direction: Tensor) -> Tensor:
     tangential, sagittal = base.exit_pupil_position
     place = safe_divide(2 * tangential, 1 + tangential / sagittal)
     place = torch.where(torch.isinf(tangential), 2 * sagittal, place)
-    at, along = (vector[..., None] for vector in (base.position, base.direction))
+    vertex, along = (vector[..., None] for vector in (base.position, base.direction))
     slant = dot(direction, along)
     finite = base.valid[..., None] & torch.isfinite(place)[..., None] & (slant != 0)
-    ahead = dot(centre - at, along) - torch.where(finite, place[..., None], 0.0)
+    ahead = dot(centre - vertex, along) - torch.where(finite, place[..., None], 0.0)
     radius = ahead / torch.where(finite, slant, 1.0)
     return torch.where(finite & (radius != 0), radius, torch.inf)
 
 
-def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """Mean OPD (D, F, W) in mm over the light that arrives; empty: what it is where none does, see `spot_of`."""
-    return where_lit(_is_lit(wavefront), (_share(wavefront) * wavefront.opd).sum(-1), empty=empty)[0]
-
-
 def rms(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """RMS of the OPD about its mean (D, F, W), mm; empty: what it is where no light arrives, see `spot_of`."""
+    """RMS of the OPD about its mean (D, F, W), mm; empty: its value where no light arrives, see `spot_of`."""
     share = _share(wavefront)
     centred = torch.where(wavefront.valid, wavefront.opd - (share * wavefront.opd).sum(-1, keepdim=True), 0.0)
     return where_lit(_is_lit(wavefront), safe_sqrt((share * centred * centred).sum(-1)), empty=empty)[0]
@@ -222,18 +217,18 @@ def zernike_coefficients(
     """Coefficients 1 … count (D, F, W, count) in mm, fitted to the rays that arrive.
 
     numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
-    empty: what they are where the light fills too little of the entrance pupil to separate them (a fit would enlarge
+    empty: their value where the light fills too little of the entrance pupil to separate them (a fit would enlarge
     the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot_of`.
     Raises ValueError for another numbering.
     """
     if numbering not in zernike.NUMBERINGS:
         raise ValueError(f"Zernike terms by {numbering!r}: expected one of {', '.join(zernike.NUMBERINGS)}")
-    order, unity = zernike.NUMBERINGS[numbering]
-    orders = [order(j) for j in range(1, count + 1)]
+    order_of, unity = zernike.NUMBERINGS[numbering]
+    orders = [order_of(j) for j in range(1, count + 1)]
     basis = _basis(wavefront, orders)
-    found, known = zernike.fit_known(wavefront.opd, basis, wavefront.energy, worst=_WORST_CONDITION)
-    found = found * found.new_tensor([zernike.norm(*o) for o in orders]) if unity == "rim" else found
-    return where_lit(known[..., None], found, empty=empty)[0]
+    terms, known = zernike.fit_known(wavefront.opd, basis, wavefront.energy, worst=_WORST_CONDITION)
+    terms = terms * terms.new_tensor([zernike.norm(*order) for order in orders]) if unity == "rim" else terms
+    return where_lit(known[..., None], terms, empty=empty)[0]
 
 
 def without(wavefront: Wavefront, count: int) -> Tensor:

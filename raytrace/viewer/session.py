@@ -10,7 +10,8 @@ from pathlib import Path
 from raytrace.io import WRITTEN, write_lens
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.least_squares import Cycle
-from raytrace.optimization.optimize import Optimized, optimize
+from raytrace.optimization.optimize import optimize
+from raytrace.optimization.optimized import Optimized
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 from raytrace.viewer.compute import mtf_of_field, refresh, remarks

@@ -21,11 +21,12 @@ from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_
 from raytrace.maths.numerics import in_transform, value
 from raytrace.maths.result import Column, Result, Table, masked, number, rows
 from raytrace.maths.sampling import Grid, centres, grid
+from raytrace.plotting.style import Figure
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import figures
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, in_contact, is_flat
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, has_features, in_contact
 from raytrace.wave_optics.element_files import ELEMENT_FORMATS, SMOOTH, read_element
 from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
@@ -140,7 +141,7 @@ class ElementPsf(Result):
         ]
         return [Table(self.columns(), lines)]
 
-    def draw(self, *, what: str = "kernels", progress: "Progress | None" = None):
+    def draw(self, *, what: str = "kernels", progress: "Progress | None" = None) -> Figure:
         """The kernels, "heights" of the element, "caustic" or "encircled" energy; progress: of a caustic."""
         if what == "heights":
             return figures.height_figure(self.scene.elements, title=self.title)
@@ -156,14 +157,19 @@ class ElementPsf(Result):
             raise ValueError(f"{path}: expected a name that ends in .npz")
         tensors = {"psf": self.kernel, "centre": self.grid.centre, "energy": self.energy}
         tensors |= {"depths": self.depths, "wavelengths": self.wavelengths}
-        arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
+        arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in tensors.items()}
         arrays |= {"pixel_pitch": float(self.pitch), "element": self.element}
         arrays |= {"engine": self.plan.engine, "samples": self.plan.samples, "error": self.plan.error}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 
 
 def psf(
-    scene: WaveScene, *, plan: Plan | None = None, memo: Memo | None = None, behind: Tensor | None = None, **sampling
+    scene: WaveScene,
+    *,
+    plan: Plan | None = None,
+    memo: Memo | None = None,
+    behind: Tensor | None = None,
+    **sampling: Any,
 ) -> ElementPsf:
     """PSFs of a scene, differentiable in every number of it.
 
@@ -188,27 +194,28 @@ def psf_by_depth(scene: WaveScene) -> ElementPsf:
     pitches = [element.profile.pitch for element in scene.elements if isinstance(element.profile, Rings)]
     samples = math.ceil(float(2 * aperture(scene) / min(pitches))) if pitches else None
     depths = (dataclasses.replace(scene, depths=depth[None]) for depth in scene.depths.unbind())
-    parts = [psf(one, tol=5e-3, samples=samples) for one in depths]
+    parts = [psf(part, tol=5e-3, samples=samples) for part in depths]
     return ElementPsf(torch.cat([part.kernel for part in parts]), scene, parts[0].plan)
 
 
 def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan, None], Any]) -> Any:
     """`make(scene, plan, None)` without graph, from memory where nothing but heights and coefficients has changed."""
     numbers, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
+    key: Any = structure
     for element in scene.elements:
         free = element.numbers
         # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
         jumps = isinstance(element.profile, EvenPowers) and element.period is not None
-        pitch = element.profile.pitch if is_flat(element) else None
+        pitch = element.profile.pitch if has_features(element.profile) else None
         parts = [element.radius, pitch, element.period, free.detach() if jumps else None]
         numbers += [t for t in parts if t is not None]
         kind = (type(element.profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
-        structure = (structure, *kind)
+        key = (key, *kind)
     if in_transform() or any(n.requires_grad for n in numbers):
         memo.made += 1
         return make(scene, plan, None)
     with torch.no_grad():
-        return memo.find(numbers, (structure, plan), lambda: make(scene, plan, None), most=_KEPT)
+        return memo.find(numbers, (key, plan), lambda: make(scene, plan, None), most=_KEPT)
 
 
 COLOURS = (0.46, 0.55, 0.64)
@@ -219,7 +226,7 @@ _PLANES, _RANGE, _ACROSS = 151, (0.75, 1.25), 0.05  # of a caustic: over the sen
 _COLUMNS = 201
 
 #: Shows the progress of a loop: (its items, their unit) -> the items.
-Progress = Callable[[Sequence, str], Iterable]
+Progress = Callable[[Any, str], Iterable]
 
 
 def _silent(items: Sequence, unit: str) -> Sequence:
@@ -264,32 +271,43 @@ def wave_psf(
     kernel alone would take too much.
     """
     if isinstance(element, str | os.PathLike):
-        design = {"aperture": aperture, "sensor": sensor, "focus": focus, "exact": exact}
-        material = {"glass": glass, "index": index, "pitch": pitch, "span": span, "catalog": catalog}
-        wrap = {"design_wavelength": design_wavelength, "levels": levels, "wavelengths": wavelengths}
-        parts, name = phase_elements(element, **design, **material, **wrap), str(element)
+        name = str(element)
+        parts = phase_elements(
+            element,
+            aperture=aperture,
+            sensor=sensor,
+            focus=focus,
+            design_wavelength=design_wavelength,
+            levels=levels,
+            exact=exact,
+            glass=glass,
+            index=index,
+            wavelengths=wavelengths,
+            pitch=pitch,
+            span=span,
+            catalog=catalog,
+        )
     else:
         parts = in_contact(element)
-        own = 2 * float(parts[0].radius.detach()) if parts else 0.0
+        diameter = 2 * float(parts[0].radius.detach()) if parts else 0.0
         fixed = {"glass": glass, "index": index, "pitch": pitch, "span": span, "levels": levels}
         fixed |= {"design_wavelength": design_wavelength}
-        fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, own) else aperture}
-        if parameter := next((name for name, number in fixed.items() if number is not None), ""):
-            raise ValueError(
-                f"{option(parameter)} belongs to an element by name or from a file; an Element has its own"
-            )
+        fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, diameter) else aperture}
+        if parameter := next((word for word, number in fixed.items() if number is not None), ""):
+            message = "belongs to an element by name or from a file; an Element has it already"
+            raise ValueError(f"{option(parameter)} {message}")
         name = " + ".join(part.kind.words for part in parts)
-    for glass in {id(part.glass.coefficients): part.glass for part in parts}.values():
-        check_unit(torch.tensor(wavelengths), [glass])
-        if glass.formula == "constant":
+    for material in {id(part.glass.coefficients): part.glass for part in parts}.values():
+        check_unit(torch.tensor(wavelengths), [material])
+        if material.formula == "constant":
             continue
-        low, high = glass.wavelength_range or (0.0, math.inf)
+        low, high = material.wavelength_range or (0.0, math.inf)
         if outside := ", ".join(f"{wavelength:g}" for wavelength in wavelengths if not low <= wavelength <= high):
-            name = glass.name or "the material"
-            raise ValueError(f"{name} has indices from {low:g} to {high:g} µm, none at {outside} µm")
-        check_wavelengths(glass, wavelengths)
-    distances, window = [_double(numbers) for numbers in (sensor, depths, wavelengths)], grid(_double(pixel), size)
-    scene = WaveScene(parts, *distances, window, exact)
+            words = material.name or "the material"
+            raise ValueError(f"{words} has indices from {low:g} to {high:g} µm, none at {outside} µm")
+        check_wavelengths(material, wavelengths)
+    window = grid(_double(pixel), size)
+    scene = WaveScene(parts, _double(sensor), _double(depths), _double(wavelengths), window, exact)
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
     windows = [window, grid(_double(pixel), 1)] if size % 2 == 0 else [window]  # a corner of four pixels on the axis
     kernel, *axial = _kernels(scene, windows, chosen, progress)
@@ -329,8 +347,8 @@ def phase_elements(
             raise ValueError(f"{option(parameter)} belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
             raise ValueError(f"{option('levels')}: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
-        distances = {"radius": 0.5 * aperture, "sensor": sensor, "focus": focus}
-        conditions = aim(**distances, wavelength=design_wavelength or DESIGN, exact=exact)
+        wavelength = design_wavelength or DESIGN
+        conditions = aim(radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=wavelength, exact=exact)
         return baseline(name, conditions, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in ELEMENT_FORMATS:
         raise ValueError(
@@ -344,9 +362,17 @@ def phase_elements(
             glass = from_table(wavelengths, index)
         except ValueError as error:
             raise ValueError(f"{option('index')}: {error}") from error
-    made_of = {"glass": glass, "pitch": pitch, "span": span, "catalog": catalog}
-    wrap = {"design_wavelength": design_wavelength, "levels": levels or 0}
-    return (read_element(element, aperture=aperture, **made_of, **wrap),)
+    part = read_element(
+        element,
+        aperture=aperture,
+        glass=glass,
+        pitch=pitch,
+        span=span,
+        design_wavelength=design_wavelength,
+        levels=levels or 0,
+        catalog=catalog,
+    )
+    return (part,)
 
 
 def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: Progress) -> list[Tensor]:
@@ -363,19 +389,18 @@ def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: 
 
     def each(part: WaveScene, behind: Tensor | None) -> list[Tensor]:
         scenes = (dataclasses.replace(part, grid=window) for window in windows)
-        return [psf(one, plan=chosen, behind=behind).kernel for one in scenes]
+        return [psf(scene, plan=chosen, behind=behind).kernel for scene in scenes]
 
     if whole:
         return each(scene, planning.behind(scene, chosen))
     kernels, behind = [], None
     for w, d in progress([(w, d) for w in range(W) for d in range(D)], "kernel"):
-        point = {"depths": scene.depths[d : d + 1], "wavelengths": scene.wavelengths[w : w + 1]}
-        part = dataclasses.replace(scene, **point)
+        part = dataclasses.replace(scene, depths=scene.depths[d : d + 1], wavelengths=scene.wavelengths[w : w + 1])
         if d == 0:
             behind = None  # frees the light of the last wavelength first
             behind = planning.behind(part, chosen)
         kernels.append(each(part, behind))
-    return [torch.cat(found).unflatten(0, (W, D))[:, :, 0].movedim(1, 0) for found in zip(*kernels, strict=True)]
+    return [torch.cat(parts).unflatten(0, (W, D))[:, :, 0].movedim(1, 0) for parts in zip(*kernels, strict=True)]
 
 
 @torch.no_grad()
@@ -395,5 +420,5 @@ def caustic(scene: WaveScene, *, progress: Progress = _silent) -> tuple[Tensor, 
     return torch.stack(planes, -2), distances, half
 
 
-def _double(numbers) -> Tensor:
+def _double(numbers: Sequence[float] | float) -> Tensor:
     return torch.as_tensor(numbers, dtype=torch.float64)

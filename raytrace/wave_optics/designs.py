@@ -8,6 +8,7 @@ the design wavelength. A wrapped lens of power φ has the power φ λ/λ₀, a s
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from raytrace.maths.zernike import noll, norm
 from raytrace.wave_optics.element import ETCHED, TURNED, Element, EvenPowers, Rings, Zernike, fabricated_height, period
 from raytrace.wave_optics.fabrication import as_rings, features, wrapped
 
-#: How steep a sphere may be, (R/z)², for its series to be worth summing.
+#: The steepest sphere, (R/z)², whose series is summed.
 _STEEPEST = 0.8
 #: Object distances of the multifocal lens, mm: 2, 1.5, 1, 0.5 and 0 dioptres.
 FOCI = (500.0, 2000 / 3, 1000.0, 2000.0, math.inf)
@@ -58,8 +59,8 @@ def aim(
         if not number > 0 or (name != "focus" and not number < math.inf):
             unit = "µm" if name == "wavelength" else "mm"
             raise ValueError(f"the {name} is {float(number):g} {unit}; expected a positive number")
-    tensors = (n if isinstance(n, Tensor) else torch.tensor(n, dtype=torch.float64) for n in numbers.values())
-    return Aim(*tensors, exact=exact)
+    tensors = [n if isinstance(n, Tensor) else torch.tensor(n, dtype=torch.float64) for n in numbers.values()]
+    return Aim(tensors[0], tensors[1], tensors[2], tensors[3], exact)
 
 
 def converging(aim: Aim, focus: Tensor | None = None) -> Tensor:
@@ -227,7 +228,7 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
     stacked = torch.stack(forms)
 
     def energy(element: Element) -> Tensor:
-        heights = fabricated_height(element.profile.heights, element.period, element.levels).double()
+        heights = fabricated_height(element.numbers, element.period, element.levels).double()
         phase = _phase(element.glass, wavelengths) * heights
         field = (stacked @ torch.polar(torch.ones_like(phase), phase)[..., None])[..., 0]
         return (field.real**2 + field.imag**2).sum(-1)
@@ -244,11 +245,11 @@ _DESIGNS = ideal, singlet, fresnel, multifocal, multifocal_refractive, cubic, cu
 #: Name -> (aim, options) -> elements in contact.
 BASELINES: dict[str, Callable[..., tuple[Element, ...]]] = {f.__name__.replace("_", "-"): f for f in _DESIGNS}
 
-#: Those that can have steps of a wave.
+#: Designs that can have steps of a wave.
 STEPPED = tuple(name for name, design in BASELINES.items() if "levels" in inspect.signature(design).parameters)
 
 
-def baseline(name: str, aim: Aim, **options) -> tuple[Element, ...]:
+def baseline(name: str, aim: Aim, **options: Any) -> tuple[Element, ...]:
     """The baseline of a name. Raises ValueError for an unknown name, TypeError for an unknown option."""
     if name not in BASELINES:
         raise ValueError(f"no baseline is called {name!r}; expected one of {', '.join(BASELINES)}")

@@ -11,7 +11,7 @@ differentiable.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import torch
 from torch import Tensor
@@ -56,7 +56,9 @@ class EvenPowers:
     coefficients: Tensor
 
 
-Profile = Pixels | Rings | Zernike | EvenPowers
+#: Profiles of features of one pitch, flat each.
+Flat = Pixels | Rings
+Profile = Flat | Zernike | EvenPowers
 
 
 def _pixels(profile: Pixels, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
@@ -91,7 +93,7 @@ class Kind(NamedTuple):
 
     words: str
     numbers: str
-    height: Callable[[Profile, Tensor, Tensor, Tensor], Tensor]
+    height: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
     is_radial: bool = False
     is_flat: bool = False
 
@@ -122,7 +124,7 @@ class Element:
 
     def __repr__(self) -> str:
         count, across = " × ".join(map(str, self.numbers.shape)), 2 * float(self.radius.detach())
-        if self.kind.is_flat:
+        if has_features(self.profile):
             words = f"{count} {self.kind.words} of {1e3 * float(self.profile.pitch.detach()):g} µm"
         else:
             words = f"{self.kind.words}, {count} coefficients"
@@ -142,7 +144,8 @@ class Element:
 
     def with_numbers(self, numbers: Tensor) -> "Element":
         """The element with other heights or coefficients."""
-        return dataclasses.replace(self, profile=dataclasses.replace(self.profile, **{self.kind.numbers: numbers}))
+        change: dict[str, Any] = {self.kind.numbers: numbers}
+        return dataclasses.replace(self, profile=dataclasses.replace(self.profile, **change))
 
 
 #: Profiles of `element` by name: the value, the number of axes of its numbers.
@@ -206,7 +209,7 @@ def phase_element(
 
 def check_fills(profile: Profile, aperture: float, place: str = "") -> None:
     """Raise ValueError for heights that do not fill an aperture of so many mm, but for one feature at the rim."""
-    if not KINDS[type(profile)].is_flat:
+    if not has_features(profile):
         return
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
     across = min(counts) * float(profile.pitch)
@@ -235,9 +238,14 @@ def is_radial(element: Element) -> bool:
     return element.kind.is_radial
 
 
+def has_features(profile: Profile) -> TypeGuard[Flat]:
+    """Whether a profile has features of one pitch, flat each."""
+    return KINDS[type(profile)].is_flat
+
+
 def is_flat(element: Element) -> bool:
     """Whether the height has features, flat each."""
-    return element.kind.is_flat
+    return has_features(element.profile)
 
 
 def is_smooth(element: Element) -> bool:

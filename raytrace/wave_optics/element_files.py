@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -17,14 +18,17 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import FORMULAS, Glass
 from raytrace.maths.numerics import to
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
-from raytrace.wave_optics.element import Element, EvenPowers, Zernike, check_fills, is_flat
+from raytrace.wave_optics.element import Element, EvenPowers, Profile, Zernike, check_fills, has_features
 from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 from raytrace.words import option
 
 #: Suffix of smooth elements, and their profiles by their name in the file.
 SMOOTH = ".json"
-_PROFILES = {"even powers of r, mm^(1 - 2k)": EvenPowers, "Noll's polynomials, mm RMS": Zernike}
+_PROFILES: dict[str, type[EvenPowers | Zernike]] = {
+    "even powers of r, mm^(1 - 2k)": EvenPowers,
+    "Noll's polynomials, mm RMS": Zernike,
+}
 
 _MOST = 1 << 26  # bytes of a label
 
@@ -53,10 +57,13 @@ def write_element(element: Element, path: str | os.PathLike, *, design_wavelengt
     Heights are those of `fabricated`: modulo the period, in steps; the file has no period. The label has their range in
     the aperture, mm. Raises HeightMapError for data that the format cannot hold.
     """
-    path, glass = Path(path), element.glass
-    if is_flat(element) or path.suffix.lower() != SMOOTH:
-        write_heights((fabricated(element) if is_flat(element) else element).profile, path)
-        shape = {"pitch": float(element.profile.pitch.detach())}
+    path, glass, profile = Path(path), element.glass, element.profile
+    shape: dict[str, Any] = {}
+    if has_features(profile):
+        write_heights(fabricated(element).profile, path)
+        shape = {"pitch": float(profile.pitch.detach())}
+    elif path.suffix.lower() != SMOOTH:
+        write_heights(profile, path)  # raises HeightMapError
     elif element.period is not None:
         raise HeightMapError("a wrapped profile is not smooth; take as_rings or as_pixels", str(path))
     else:
@@ -97,7 +104,8 @@ def read_element(
     """
     label, file = read_label(path), str(path)
     if isinstance(glass, str):
-        glass = find_glass(glass, user=tuple(catalog))
+        glass = find_glass(glass, user=tuple(map(Path, catalog)))
+    profile: Profile
     if Path(path).suffix.lower() == SMOOTH:
         if label is None or label.profile is None:
             raise HeightMapError("is no smooth element: expected the coefficients of one", file)
@@ -107,18 +115,22 @@ def read_element(
         if aperture > label.aperture * (1 + 1e-9) or (is_fixed and aperture < label.aperture * (1 - 1e-9)):
             raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
     else:
-        profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
-        profile = to(profile, dtype=torch.float64)
+        low_high = (span[0], span[1]) if span else None
+        heights = read_heights(path, pitch=pitch or (None if label is None else label.pitch), span=low_high)
+        profile = to(heights, dtype=torch.float64)
         check_fills(profile, aperture, f"{path}: ")
-        if glass is None and label is None:
-            raise ValueError(
-                f"{path}: has no material (there is no {_label_of(path).name}); give {option('glass', 'NAME')}, "
-                f"as PMMA, or {option('index', 'N')} for each wavelength"
-            )
-    element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
+    if glass is None and label is not None:
+        glass = label.glass
+    if glass is None:
+        raise ValueError(
+            f"{path}: has no material (there is no {_label_of(path).name}); give {option('glass', 'NAME')}, as PMMA, "
+            "or "
+            f"{option('index', 'N')} for each wavelength"
+        )
+    element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass)
     if not (design_wavelength or levels):
         return element
-    design = design_wavelength or (label and label.design_wavelength)
+    design = design_wavelength or (None if label is None else label.design_wavelength)
     if not design:
         raise ValueError(f"{path}: has no design wavelength; give {option('design_wavelength')}")
     return wrapped(element, design, levels=levels)
@@ -130,15 +142,12 @@ def read_label(path: str | os.PathLike) -> Label | None:
     if not file.exists():
         return None
     try:
-        label = parsed(read_bytes(file, _MOST))
-        label = (_SMOOTH if isinstance(label, dict) and "profile" in label else _OF_HEIGHTS)(label)
-        count, listed_count, span = (
-            FORMULAS[label["formula"]].count,
-            len(label["coefficients"]),
-            label["wavelength_range"],
-        )
-        if listed_count != count:
-            raise Unfit(f"coefficients: found a list of {listed_count}, expected {count} of them")
+        document = parsed(read_bytes(file, _MOST))
+        is_smooth = isinstance(document, dict) and "profile" in document
+        label: Any = (_SMOOTH if is_smooth else _OF_HEIGHTS)(document)
+        count, span = FORMULAS[label["formula"]].count, label["wavelength_range"]
+        if len(label["coefficients"]) != count:
+            raise Unfit(f"coefficients: found a list of {len(label['coefficients'])}, expected {count} of them")
         if span is not None and not span[0] < span[1]:
             raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
     except (OSError, Unfit) as error:

@@ -27,7 +27,7 @@ from raytrace.wave_optics.element import (
     period,
 )
 
-_CANDIDATES = 256  # depths within the relief, where any can be made
+_CANDIDATES = 256  # depths within the relief of a process without steps
 _ROUNDS = 12  # of depths and pistons in turn
 _TRIES = 6  # first pistons
 

@@ -3,23 +3,48 @@
 import math
 import textwrap
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.sampling import centres
+from raytrace.maths.sampling import Grid, centres
 from raytrace.plotting import style
-from raytrace.plotting.style import array, framed, new_figure, styled
-from raytrace.wave_optics.element import Element, height, is_flat, is_smooth
+from raytrace.plotting.style import Axes, Figure, array, framed, new_figure, styled
+from raytrace.wave_optics.element import Element, has_features, height, is_smooth
+from raytrace.wave_optics.scene import WaveScene
 
 _GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
 _DECADES = 4.0  # of light in a caustic
 _ACROSS = 700  # points across a disc of heights
 
 
+class Kernels(Protocol):
+    """PSFs of an element, as `wave_optics.compute.ElementPsf` has them."""
+
+    @property
+    def kernel(self) -> Tensor: ...
+    @property
+    def scene(self) -> WaveScene: ...
+    @property
+    def grid(self) -> Grid: ...
+    @property
+    def pitch(self) -> Tensor: ...
+    @property
+    def depths(self) -> Tensor: ...
+    @property
+    def wavelengths(self) -> Tensor: ...
+    @property
+    def energy(self) -> Tensor: ...
+    @property
+    def peak(self) -> Tensor: ...
+    @property
+    def title(self) -> str: ...
+
+
 @styled
-def psf_figure(psfs):
+def psf_figure(psfs: Kernels) -> Figure:
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
@@ -35,7 +60,7 @@ def psf_figure(psfs):
     channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
     shares = channels / channels.sum(1, keepdims=True).clip(1e-9)
     # From black through the colour to white: the peak is white, as on film.
-    ramps = [[(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")] for colour in colours]
+    ramps = [((0.0, to_rgb("black")), (0.72, to_rgb(colour)), (1.0, to_rgb("white"))) for colour in colours]
     maps = [LinearSegmentedColormap.from_list("light", ramp) for ramp in ramps]
     figure = new_figure(max(3.4, 1.75 * columns + 0.6), 1.95 * len(kernels) + 0.8)
     axes = figure.subplots(len(kernels), columns, squeeze=False)
@@ -73,9 +98,9 @@ def psf_figure(psfs):
 
 
 @styled
-def height_figure(elements: Sequence[Element], *, title: str = ""):
-    """The heights of elements in contact as they are made, a row for each: the disc, the profile along x, and the rim
-    of one that has steps."""
+def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
+    """The fabricated heights of elements in contact, a row for each: the disc, the profile along x, and the rim of an
+    element with steps."""
     figure = new_figure(7.6, 3.1 * len(elements))
     grid = figure.add_gridspec(2 * len(elements), 2, width_ratios=(1.15, 1.6))
     for row, element in enumerate(elements):
@@ -98,7 +123,7 @@ def height_figure(elements: Sequence[Element], *, title: str = ""):
             continue
         whole, rim = figure.add_subplot(grid[above, 1]), figure.add_subplot(grid[below, 1])
         _profile(whole, element, -R, R)
-        feature = float(element.profile.pitch) if is_flat(element) else R / 500
+        feature = float(element.profile.pitch) if has_features(element.profile) else R / 500
         _profile(rim, element, R - min(0.3 * R, 40 * feature), R)
         rim.set_xlabel("x, mm  (above: the whole diameter; here: the rim)")
     figure.suptitle(title, fontweight="bold", fontsize=10)
@@ -106,7 +131,7 @@ def height_figure(elements: Sequence[Element], *, title: str = ""):
 
 
 @styled
-def caustic_figure(psfs, light: Tensor, distances: Tensor, half: float):
+def caustic_figure(psfs: Kernels, light: Tensor, distances: Tensor, half: float) -> Figure:
     """Light per mm² over the distance behind the element, logarithmic; arguments: of `wave_optics.compute.caustic`.
 
     A row for each depth, a column for each wavelength; one scale for all; a dashed line at the sensor.
@@ -141,7 +166,7 @@ def caustic_figure(psfs, light: Tensor, distances: Tensor, half: float):
 
 
 @styled
-def encircled_figure(psfs):
+def encircled_figure(psfs: Kernels) -> Figure:
     """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
     x, y = (array(line) for line in centres(psfs.grid))
     radius = np.hypot(x, y[:, None]).ravel()
@@ -163,7 +188,7 @@ def encircled_figure(psfs):
     return figure
 
 
-def _profile(panel, element: Element, first: float, last: float) -> None:
+def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
     """h(x) at y = 0 as a line."""
     x = torch.linspace(first, last, 4001, dtype=element.radius.dtype)
     with torch.no_grad():

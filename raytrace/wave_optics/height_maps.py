@@ -28,10 +28,8 @@ from PIL import Image, PngImagePlugin
 from raytrace.files import read_bytes, write_atomically
 from raytrace.io.pictures import PictureError, decoded
 from raytrace.maths.arrays import LARGEST, ArrayError, read_npy
-from raytrace.wave_optics.element import Pixels, Rings
+from raytrace.wave_optics.element import Flat, Pixels, Profile, Rings
 from raytrace.words import RaytraceError
-
-Map = Pixels | Rings
 
 #: The largest grey value of 16 bits.
 _WHITE = 65535
@@ -63,13 +61,13 @@ class Known(NamedTuple):
 class Format(NamedTuple):
     """read(content, file, known) -> profile; write(profile, file) -> content."""
 
-    read: Callable[[bytes, str, Known], Map]
-    write: Callable[[Map, str], bytes]
+    read: Callable[[bytes, str, Known], Flat]
+    write: Callable[[Flat, str], bytes]
 
 
 def read_heights(
     path: str | os.PathLike, *, pitch: float | None = None, span: tuple[float, float] | None = None
-) -> Map:
+) -> Flat:
     """The height map of a file, float64 (an .npy keeps its own precision): Pixels, or Rings of a round one.
 
     pitch: mm, for a file without it; span: heights mm of grey 0 and 65535, for a picture without description. Raises
@@ -88,7 +86,7 @@ def read_heights(
     return profile
 
 
-def write_heights(profile: Map, path: str | os.PathLike) -> None:
+def write_heights(profile: Profile, path: str | os.PathLike) -> None:
     """Write a height map in the format of the suffix. The file is replaced as a whole or not at all.
 
     Raises HeightMapError for data that the format cannot hold and where the file cannot be written.
@@ -106,14 +104,14 @@ def write_heights(profile: Map, path: str | os.PathLike) -> None:
         raise HeightMapError(error.strerror or str(error), file) from error
 
 
-def _write_npy(profile: Map, file: str) -> bytes:
+def _write_npy(profile: Flat, file: str) -> bytes:
     stream = io.BytesIO()
     np.save(stream, _array(profile), allow_pickle=False)
     np.save(stream, np.array([float(profile.pitch)]), allow_pickle=False)
     return stream.getvalue()
 
 
-def _read_npy(content: bytes, file: str, known: Known) -> Map:
+def _read_npy(content: bytes, file: str, known: Known) -> Flat:
     try:
         heights, *rest = read_npy(content)
     except ArrayError as error:
@@ -128,7 +126,7 @@ def _read_npy(content: bytes, file: str, known: Known) -> Map:
     return _profile(heights.astype(heights.dtype.newbyteorder("=")), pitch, file)
 
 
-def _write_picture(profile: Map, file: str, kind: str) -> bytes:
+def _write_picture(profile: Flat, file: str, kind: str) -> bytes:
     """A picture of a kind, "PNG" or "TIFF": 16-bit grey, the largest y on top, and a description."""
     heights = np.atleast_2d(_array(profile).astype(np.float64))[::-1]
     low, high = float(heights.min()), float(heights.max())
@@ -145,7 +143,7 @@ def _write_picture(profile: Map, file: str, kind: str) -> bytes:
     return stream.getvalue()
 
 
-def _read_picture(content: bytes, file: str, known: Known) -> Map:
+def _read_picture(content: bytes, file: str, known: Known) -> Flat:
     try:
         picture = decoded(content)
     except PictureError as error:
@@ -186,7 +184,7 @@ def _meaning(text: str, file: str, known: Known) -> dict:
     return {"profile": "pixels", "offset": low, "scale": (high - low) / _WHITE, "pitch": known.pitch}
 
 
-def _write_csv(profile: Map, file: str) -> bytes:
+def _write_csv(profile: Flat, file: str) -> bytes:
     pitch, heights = float(profile.pitch), _array(profile)
     if isinstance(profile, Rings):
         lines = ["r_mm,sag_mm", *(f"{(k + 0.5) * pitch!r},{h!r}" for k, h in enumerate(heights.tolist()))]
@@ -197,7 +195,7 @@ def _write_csv(profile: Map, file: str) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _read_csv(content: bytes, file: str, known: Known) -> Map:
+def _read_csv(content: bytes, file: str, known: Known) -> Flat:
     lines = _text(content, file).split("\n")
     head = [name.strip().lower().removesuffix("_mm") for name in lines[0].split(",")]
     if head not in (["r", "sag"], ["x", "y", "sag"]):
@@ -208,9 +206,9 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
         row = int(np.flatnonzero(~np.isfinite(table[:, :-1]).all(1))[0])
         raise HeightMapError(f"reads {lines[row + 1][:60]!r}; expected finite places", file, row + 2)
     if len(head) == 2:
-        pitch = 2 * float(table[0, 0])
-        _expect(table[:, 0], (np.arange(len(table)) + 0.5) * pitch, pitch, "r", file, np.arange(len(table)) + 2)
-        return _profile(table[:, 1], pitch, file)
+        width = 2 * float(table[0, 0])
+        _expect(table[:, 0], (np.arange(len(table)) + 0.5) * width, width, "r", file, np.arange(len(table)) + 2)
+        return _profile(table[:, 1], width, file)
     columns = int((table[:, 1] == table[0, 1]).sum())
     rows, rest = divmod(len(table), columns)
     if rest:
@@ -239,7 +237,7 @@ def _expect(values: np.ndarray, wanted: np.ndarray, pitch: float, name: str, fil
         raise HeightMapError(message, file, int(lines[k]))
 
 
-def _write_grid(profile: Map, file: str) -> bytes:
+def _write_grid(profile: Flat, file: str) -> bytes:
     """nx ny delx dely unitflag xdec ydec; then a line z dz/dx dz/dy d²z/dxdy nodata a point, from (-x, +y) on, x first.
 
     (OpticStudio Help, "Grid Sag".) Where all slopes are 0 the program estimates them; nodata 0 is a valid point.
@@ -255,7 +253,7 @@ def _write_grid(profile: Map, file: str) -> bytes:
     return ("\r\n".join(lines) + "\r\n").encode()
 
 
-def _read_grid(content: bytes, file: str, known: Known) -> Map:
+def _read_grid(content: bytes, file: str, known: Known) -> Flat:
     lines = [(k, line) for k, line in enumerate(_text(content, file).split("\n"), 1) if not line.startswith("!")]
     if not lines:
         raise HeightMapError("holds comments only; expected a grid sag", file)
@@ -290,11 +288,11 @@ def _format(file: str) -> Format:
     return FORMATS[suffix]
 
 
-def _array(profile: Map) -> np.ndarray:
+def _array(profile: Flat) -> np.ndarray:
     return profile.heights.detach().cpu().numpy()
 
 
-def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Map:
+def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Flat:
     if pitch is None:
         raise HeightMapError(_NO_PITCH, file)
     tensor = torch.from_numpy(np.array(heights, order="C"))
@@ -302,7 +300,7 @@ def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Map:
     return kind(tensor, torch.tensor(pitch, dtype=tensor.dtype))
 
 
-def _check(profile: Map, file: str) -> None:
+def _check(profile: Flat, file: str) -> None:
     """Refuse an invalid height map: wrong number of axes, no points, numbers that are not finite, no pitch."""
     heights, axes = profile.heights, 1 if isinstance(profile, Rings) else 2
     if heights.ndim != axes or not heights.numel():

@@ -28,7 +28,7 @@ from raytrace.psf_models.dft import rings_and_arms
 from raytrace.psf_models.result import Kernels, Psf, polychromatic
 from raytrace.psf_models.wave import Waves, by_field, half_spread, phase_along_radius, probe_of, sensor_points, waves
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, media, with_object_distance
-from raytrace.system.sag_terms import GridSag, ZernikeSag, relief, spline
+from raytrace.system.sag_terms import GridSag, SplineSag, ZernikeSag, relief, spline
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
@@ -39,6 +39,7 @@ from raytrace.wave_optics.element import (
     EvenPowers,
     Rings,
     Zernike,
+    has_features,
     in_contact,
     is_flat,
     is_radial,
@@ -49,14 +50,14 @@ from raytrace.words import RaytraceError
 
 _MOST_RAYS = 400_000  # of one kernel
 
-_FINE = 32, 64  # of the points at which slopes of an element are looked for
+_FINE = 32, 64  # rings and arms of the points where slopes of an element are evaluated
 _PER_PIXEL = 8.0  # radians of phase that count for a flat pixel: two rays across it along a radius
 _PER_ZONE = 4.0  # times the phase of a wrapped height: twelve rays across a zone
 _WIDER = 1.05  # beam over element
 
 
 class TooCoarse(RaytraceError, ValueError):
-    """An element needs more rays than there can be."""
+    """An element needs more than 400,000 rays."""
 
 
 def element_lens(
@@ -138,12 +139,15 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     if isinstance(profile, EvenPowers):
         back = dataclasses.replace(back, coefficients=profile.coefficients)
     else:
-        is_series = isinstance(profile, Zernike)
-        grid = None if is_series else GridSag(profile.heights, profile.pitch)
-        sag_terms = ZernikeSag(profile.coefficients, element.radius) if is_series else spline(grid)
+        sag_terms: ZernikeSag | SplineSag
+        if isinstance(profile, Zernike):
+            sag_terms = ZernikeSag(profile.coefficients, element.radius)
+        else:
+            sag_terms = spline(GridSag(profile.heights, profile.pitch))
         centre = relief(sag_terms).sag(zero, zero, highest=0).z
         # The piston of a series; the weights of a spline sum to 1. Found once, however often it is traced.
-        pistons = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1)) if is_series else centre
+        is_series = isinstance(profile, Zernike)
+        pistons = torch.nn.functional.pad(centre[None], (0, len(element.numbers) - 1)) if is_series else centre
         sag_terms = dataclasses.replace(sag_terms, coefficients=sag_terms.coefficients - pistons)
         back = dataclasses.replace(back, sag_terms=sag_terms)
     thickness = centre + torch.as_tensor(substrate, dtype=zero.dtype)
@@ -193,7 +197,7 @@ def hybrid_psf(
     view = scene(lens, fields, distances, colours)
     chief = chief_landing(dataclasses.replace(view, wavelengths=lens.primary[None]))
     window = make_grid(like.new_tensor(pixel), size, chief.expand(*chief.shape[:-1], len(colours)))
-    psfs = polychromatic(kernels(view, parts, window, order=order), None, "hybrid")
+    psfs = polychromatic(kernels(view, parts, window, order=order), view, None, "hybrid")
     weights = torch.ones_like(colours) if wavelengths is not None else lens.wavelength_weights
     return dataclasses.replace(
         psfs,
@@ -237,7 +241,9 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
             light, stop = _unfolded(light, stop, arms)
         if elements:
             front = light.wavefront
-            added = [path(elements, *stop[:, :, :, w], colour[None])[0] for w, colour in enumerate(front.wavelength)]
+            x, y = stop
+            colours = range(x.shape[2])
+            added = [path(elements, x[:, :, w], y[:, :, w], front.wavelength[w : w + 1])[0] for w in colours]
             opd = front.opd + torch.stack(added, 2)
             light = dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=opd))
         kernel, centroid, covariance = points.integrated(light, probe)
@@ -265,15 +271,15 @@ def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:
         copies = arms
         angle = (torch.arange(arms, dtype=N.dtype, device=N.device) + 0.5) * (2 * math.pi / arms)
         c, s = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
-        pairs = ((a[..., None, :], b[..., None, :]) for a, b in pairs)
-        L_M, stop = (torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in pairs)
+        columns = ((a[..., None, :], b[..., None, :]) for a, b in pairs)
+        L_M, stop = (torch.stack([c * a - s * b, s * a + c * b]).flatten(-2) for a, b in columns)
     opd, N, amplitude = (torch.cat([t] * copies, -1) for t in (front.opd, N, light.amplitude / copies))
     front = dataclasses.replace(front, opd=opd, direction=torch.cat([L_M, N[None]]))
     return Waves(amplitude, front, "none"), stop
 
 
 def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, ...]) -> float:
-    """By how many mm on the sensor rays spread farther with the elements, plus a distance that represents their steps.
+    """Additional spread (mm) of rays on the sensor by the elements, plus a distance that represents their steps.
 
     A slope g of path at the stop moves a ray of the lens, whose directions are (L, M) = -K s for points s of the stop,
     by K⁻ᵀ g/n on the sensor, with the K that fits the directions best; elements that focus make the blur smaller.
@@ -299,8 +305,8 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
         spread = torch.where(front.usable, torch.linalg.vector_norm(front.landing + shift, dim=0), 0.0).amax(-1)
         alone = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         # `waves` samples 2πn a/λ of phase for each mm between a ray and a point, a the spread of directions.
-        steps = sum(_phase_of_steps(element, beam, probe.wavelength) for element in elements)
-        steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / (1e-3 * probe.wavelength))
+        phases = torch.stack([_phase_of_steps(element, beam, probe.wavelength) for element in elements]).sum(0)
+        steps = safe_divide(phases, 2 * math.pi * half_spread(probe) * probe.index / (1e-3 * probe.wavelength))
         return float((spread + steps - alone).max())
 
 
@@ -318,7 +324,7 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
     """Phase (W,) in radians along a radius that represents the steps of an element, and its periods round the pupil."""
     profile, none = element.profile, torch.zeros_like(wavelengths)
     excess = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths
-    if is_flat(element):
+    if has_features(profile):
         heights = profile.heights
         steps = [heights.diff(dim=axis).abs().max() for axis in range(heights.dim()) if heights.shape[axis] > 1]
         slope = torch.stack([*steps, heights.new_zeros(())]).max() / profile.pitch

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import value
+from raytrace.maths.numerics import Number, value
 from raytrace.psf_models.dft import bessel_j0, phasor
 from raytrace.wave_optics.element import Element, is_radial, is_smooth, path
 from raytrace.wave_optics.propagation import phasors, slope, to_radii
-from raytrace.wave_optics.pupil import cells_at, light_of, to_pixels
+from raytrace.wave_optics.pupil import ToPixels, cells_at, light_of, to_pixels
 from raytrace.wave_optics.scene import WaveScene, aperture, millimetres, spheres
 
 _POINTS = 12  # of the table of F per wave of its finest ripple
@@ -35,7 +35,7 @@ class MixedSums:
 
     r: (J,) mm, radii of the round part; sphere: (D, J) mm; forward: (W, n, J) from its phasors to U at n radii of the
     sensor; back: (W, T, n) from there to F at T even steps of t; place: (N, N) of the cells in that table; x, y: (N, N)
-    mm; along_x, along_y, pixel, folded: as for `PupilSums`.
+    mm.
     """
 
     r: Tensor
@@ -45,10 +45,7 @@ class MixedSums:
     place: Tensor
     x: Tensor
     y: Tensor
-    along_x: Tensor
-    along_y: Tensor
-    pixel: Tensor
-    folded: bool
+    to_pixels: ToPixels
 
 
 def is_mixed(scene: WaveScene) -> bool:
@@ -111,7 +108,7 @@ def prepare(
     back = 2 * math.pi / wavelength**2 * part * bessel_j0(2 * math.pi * table[:, None] * rho / wavelength)
     x, y, _ = cells_at(scene, axis)
     place = torch.sqrt(axis * axis + (axis * axis)[:, None]) / step
-    return MixedSums(r, spheres(scene, r * r), forward, back * dt * dt, place, x, y, *to_pixels(scene, axis, nodes))
+    return MixedSums(r, spheres(scene, r * r), forward, back * dt * dt, place, x, y, to_pixels(scene, axis, nodes))
 
 
 def intensity(scene: WaveScene, sums: MixedSums) -> Tensor:
@@ -120,19 +117,19 @@ def intensity(scene: WaveScene, sums: MixedSums) -> Tensor:
     rays = torch.view_as_real(phasors(round_part(scene), sums.r, sums.sphere))  # (D, W, J, 2)
     tables = torch.view_as_complex((sums.back @ (sums.forward @ rays)).contiguous())
     free = phasor(path(_free(scene), sums.x, sums.y, scene.wavelengths) / wavelength[..., None])
-    return torch.stack([light_of(scene, sums, _between(table, sums.place) * free) for table in tables])
+    return torch.stack([light_of(scene, sums.to_pixels, _between(table, sums.place) * free) for table in tables])
 
 
 def _between(table: Tensor, place: Tensor) -> Tensor:
     """An even function at places (N, N) ≥ 0, in steps, of a table (W, T): six-point Lagrange interpolation."""
     first = torch.floor(place).long() - 2
     offset = place - first
-    total = 0.0
+    total: Number = 0.0
     for j in range(6):
         others = [k for k in range(6) if k != j]
-        weight = math.prod(1 / (j - k) for k in others)
+        weight: Number = math.prod(1 / (j - k) for k in others)
         for k in others:
             weight = weight * (offset - k)
-        at = (first + j).abs().clamp(max=table.shape[-1] - 1)
-        total = total + weight * table[:, at]
+        step = (first + j).abs().clamp(max=table.shape[-1] - 1)
+        total = total + weight * table[:, step]
     return total

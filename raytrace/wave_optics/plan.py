@@ -18,6 +18,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -36,6 +37,7 @@ from raytrace.wave_optics.element import (
     designed_height,
     excess_index,
     fabricated_height,
+    has_features,
     height,
     is_flat,
     is_smooth,
@@ -87,7 +89,7 @@ def spread(scene: WaveScene) -> Spread:
         light, squares = light + share * inside, squares + share**2 * squared
     # Where no two rays meet the light is thin: an even disc.
     area = torch.where(squares > 0, light / squares.clamp(min=1e-300), math.pi * width)
-    return Spread(torch.sqrt(width), area, sum(_steps_of(e, scene) for e in scene.elements))
+    return Spread(torch.sqrt(width), area, torch.stack([_steps_of(e, scene) for e in scene.elements]).sum(0))
 
 
 def is_free(element: Element) -> bool:
@@ -124,9 +126,9 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
     return total
 
 
-def blur_of_pixels(scene: WaveScene) -> Tensor:
+def blur_of_pixels(scene: WaveScene, profile: Pixels) -> Tensor:
     """Radius (D, W) mm of a disc as wide, in the mean square, as the light behind a map of pixels."""
-    profile, R = scene.elements[0].profile, aperture(scene).detach()
+    R = aperture(scene).detach()
     pitch = profile.pitch.detach()
     y, x = ((torch.arange(n, dtype=R.dtype, device=R.device) - 0.5 * (n - 1)) * pitch for n in profile.heights.shape)
     x, y = torch.broadcast_tensors(x, y[:, None])
@@ -156,11 +158,11 @@ def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) 
 def _landings(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Points (D, W, M) mm on the sensor of rays through some of the elements; they cross steps of rings radially."""
     R, wavelength = aperture(scene), millimetres(scene)[:, None]
-    features = [e.profile.pitch for e in elements if is_flat(e)]
+    features = [e.profile.pitch for e in elements if has_features(e.profile)]
     step = min(features) if features else wavelength.min() * scene.sensor_distance / (8 * R)
     along = torch.ones_like(x), torch.zeros_like(x)
     if any(isinstance(e.profile, Rings) for e in elements):
-        along = tuple(p / torch.hypot(x, y) for p in (x, y))
+        along = x / torch.hypot(x, y), y / torch.hypot(x, y)
 
     def waves(share: float, a: Tensor, b: Tensor) -> Tensor:
         u, v = x + share * step * a, y + share * step * b
@@ -201,7 +203,7 @@ def _steps_of(element: Element, scene: WaveScene) -> Tensor:
     def squares(jumps: Tensor) -> Tensor:
         return 2 - 2 * torch.cos(2 * math.pi * waves.reshape(-1, *[1] * jumps.dim()) * jumps)
 
-    if is_flat(element):
+    if has_features(profile):
         heights = fabricated_height(profile.heights, element.period, element.levels)
     if isinstance(profile, Pixels):
         pairs = [heights.diff(dim=dim) for dim in (0, 1) if heights.shape[dim] > 1]
@@ -255,14 +257,14 @@ def setting_of(scene: WaveScene) -> Setting:
     sides = (0.5 * pitch * n for n in scene.grid.shape[::-1])
     stepped = [element for element in scene.elements if not is_smooth(element)]
     R, z = (float(number.detach()) for number in (aperture(scene), scene.sensor_distance))
-    light, focal = spread(scene), z * millimetres(scene).detach().double()
+    pixels, light, focal = only_pixels(scene), spread(scene), z * millimetres(scene).detach().double()
     core = (light.area / math.pi - (2.4 * focal / (2 * R)) ** 2 / math.pi).clamp(min=0.0).sqrt()
     far = 2 * light.area * focal * (1 + 0.5 * R * light.steps) / (2 * math.pi**3 * R)
     return Setting(
         diameter=2 * R,
         distance=z,
         shortest=float(millimetres(scene).detach().min()),
-        blur=float((blur_of_pixels(scene) if only_pixels(scene) else blur(scene)).max()),
+        blur=float((blur(scene) if pixels is None else blur_of_pixels(scene, pixels)).max()),
         reach=max(c + side for c, side in zip(centre, sides, strict=True)),
         kernels=(len(scene.depths), len(scene.wavelengths)),
         size=max(scene.grid.shape),
@@ -273,20 +275,20 @@ def setting_of(scene: WaveScene) -> Setting:
         core=float(core.max()),
         sharpest=float(core.min()),
         scatter=float((torch.sqrt(light.area * light.steps / 6) / focal).max()),
-        features=tuple(float(e.profile.pitch.detach()) for e in stepped if is_flat(e)),
+        features=tuple(float(e.profile.pitch.detach()) for e in stepped if has_features(e.profile)),
         speckle=any(is_free(element) for element in stepped),
         lattice=not scene.exact and len(stepped) == 1 and isinstance(stepped[0].profile, Pixels),
         edge=float(far.sqrt().max()),
     )
 
 
-def _tail(s: Setting, samples: int) -> float:
+def _tail(s: Setting, samples: float) -> float:
     """Of the light diffracted at the edge of the copies next to the window, which falls as the square of the gap."""
     gap = s.period(samples) - s.blur - s.reach
     return 0.3 * (s.airy / gap) ** 2 if gap > s.airy else 1.0
 
 
-def edge_error(s: Setting, samples: int, width: float | None = None) -> float:
+def edge_error(s: Setting, samples: float, width: float | None = None) -> float:
     """Of N cells with weights of sixth order at the rim: fitted over blurs and windows.
 
     width: radius mm of the light; by default that of its farthest rays, which is enough for any shape.
@@ -373,11 +375,14 @@ def half_phases(scene: WaveScene, s: Setting) -> tuple[float, float]:
     low = place.long().clamp(max=511)
     across = torch.lerp(phase[low], phase[low + 1], place - low).diff()
     bound = across if len(edges) == 2 else edges.diff() * angle[place[1:].long()]
-    return tuple(float(math.pi / s.shortest * half.max()) for half in (bound, across))
+    largest, accumulated = (float(math.pi / s.shortest * half.max()) for half in (bound, across))
+    return largest, accumulated
 
 
-def only_pixels(scene: WaveScene) -> bool:
-    return not scene.exact and len(scene.elements) == 1 and isinstance(scene.elements[0].profile, Pixels)
+def only_pixels(scene: WaveScene) -> Pixels | None:
+    """The pixels of a paraxial scene without other elements; None of another scene."""
+    profile = scene.elements[0].profile
+    return profile if isinstance(profile, Pixels) and not scene.exact and len(scene.elements) == 1 else None
 
 
 _FINEST = 4096  # cells across the aperture
@@ -441,8 +446,9 @@ def plan(
     if engine == "radial" and not round_scene:
         raise ValueError("the radial engine needs round elements and a grid centred on the axis; use engine='pupil'")
     row, setting = ENGINES[engine], setting_of(scene)
-    options = {"engine": engine, "samples": samples, "nodes": nodes, "pad": pad, "band_limit": band_limit}
-    sampling = row.plan(scene, setting, tol=tol, **options)
+    sampling = row.plan(
+        scene, setting, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
+    )
     # An engine that samples the converging field itself is a reference: not held to a tolerance.
     if row.prepare is not None and samples is None and nodes is None and sampling.error > tol:
         message = (
@@ -461,25 +467,26 @@ def _even(number: float) -> int:
     return max(16, 2 * math.ceil(0.5 * number))
 
 
-def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
+def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_: Any) -> Plan:
     nodes = nodes or gauss_count(s.band, 0.4 * tol / 0.15)
     if samples is None and is_mixed(scene):
         return _mixed(scene, s, nodes, tol)
     least = s.diameter * (s.reach + s.blur) / (s.shortest * s.distance)
-    if samples is not None and samples < least and not only_pixels(scene):
+    pixels = only_pixels(scene)
+    if samples is not None and samples < least and pixels is None:
         raise AliasedSampling(
             f"{samples} cells across the aperture repeat the image every {1e3 * s.period(samples):.0f} µm, inside the "
             f"window of ±{1e3 * s.reach:.0f} µm with a blur of ±{1e3 * s.blur:.0f} µm: take at least "
             f"{math.ceil(least)} samples, or a smaller window"
         )
     kind, extent, inner, parts = "smooth", 1.0, 1, 1
-    if only_pixels(scene):
-        profile, kind = scene.elements[0].profile, "flat"
-        across = max(cells_across(profile.pitch, n, aperture(scene)) for n in profile.heights.shape)
+    if pixels is not None:
+        kind = "flat"
+        across = max(cells_across(pixels.pitch, n, aperture(scene)) for n in pixels.heights.shape)
         bare = float(blur(scene).max())
         wanted = samples or _least(lambda n: cut_error(s, n, bare), 0.5 * tol)
         parts = max(1, math.ceil(wanted / across))
-        samples, pitch = parts * across, float(profile.pitch.detach()) / parts
+        samples, pitch = parts * across, float(pixels.pitch.detach()) / parts
         near = 1 / float(scene.depths.detach().min()) + 1 / s.distance
         half_phase = math.pi / s.shortest * pitch * (0.5 * s.diameter * near + s.reach / s.distance)
         inner = gauss_count(half_phase, 0.1 * tol)
@@ -522,7 +529,7 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
     return Plan("pupil", samples, nodes, error, flops, memory, cells="mixed", extent=extent, inner=inner, band=band)
 
 
-def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
+def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_: Any) -> Plan:
     half, phase = half_phases(scene, s)
     if samples is None:
         samples = gauss_count(half, 0.1 * tol) if half < 20 else rings_and_arms(2 * half, 0 if tol > 1e-6 else 1)[0]
@@ -537,7 +544,17 @@ def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | N
     return Plan("radial", samples, nodes, error + 1e-7, flops, s.bytes * (3 * W * K * J + K * s.pixels / 8))
 
 
-def _transfer(scene: WaveScene, s: Setting, *, engine, samples, nodes, tol, pad, band_limit) -> Plan:
+def _transfer(
+    scene: WaveScene,
+    s: Setting,
+    *,
+    engine: str,
+    samples: int | None,
+    nodes: int | None,
+    tol: float,
+    pad: float,
+    band_limit: bool,
+) -> Plan:
     nodes = nodes or gauss_count(s.band, 0.4 * tol / 0.15)
     least, slope = s.diameter * (s.diameter + 2 * s.blur) / (s.shortest * s.distance), 0.5 * s.diameter / s.distance
     if samples is None:
@@ -584,18 +601,22 @@ def _pupil_sums(scene: WaveScene, plan: Plan, behind: Tensor | None) -> pupil.Pu
     return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
 
 
-def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
-    light = (mixed if plan.cells == "mixed" else pupil).intensity(scene, sums)
-    return integrate(light, sums.pixel, scene.grid.pitch)
+def _pupil_kernels(scene: WaveScene, sums: pupil.PupilSums | mixed.MixedSums, plan: Plan) -> Tensor:
+    light = mixed.intensity(scene, sums) if isinstance(sums, mixed.MixedSums) else pupil.intensity(scene, sums)
+    return integrate(light, sums.to_pixels.pixel, scene.grid.pitch)
 
 
 def _transfer_kernels(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
     (u, v, weight), pitch, fields = sub_pixels(scene.grid, plan.nodes), 2 * aperture(scene) / plan.samples, []
-    options = {"band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
-    options["size"] = propagation.padded(plan.samples, plan.pad)
+    carried = partial(
+        propagation.propagate,
+        size=propagation.padded(plan.samples, plan.pad),
+        band_limit=plan.band_limit,
+        spectrum=plan.engine == "angular_spectrum",
+    )
     for k, wavelength in enumerate(millimetres(scene)):
         field = propagation.behind(scene, k, plan.samples)
-        field = propagation.propagate(field, pitch, scene.sensor_distance, wavelength, **options)
+        field = carried(field, pitch, scene.sensor_distance, wavelength)
         fields.append(propagation.at_nodes(field, pitch, u, v))
     U = torch.stack(fields, 1)
     return integrate(U.real**2 + U.imag**2, weight, scene.grid.pitch)

@@ -197,11 +197,11 @@ def edges(scene: WaveScene) -> Tensor:
             r = R.detach() * torch.sqrt(torch.linspace(0, 1, _PROBES, dtype=R.dtype, device=R.device))
             h = designed_height(element, r, torch.zeros_like(r)).detach()
             step = h / (element.period.detach() / max(1, element.levels))
-            at = step.floor().diff().nonzero()[:, 0]
+            k = step.floor().diff().nonzero()[:, 0]
             # The integer between the two, the higher one's floor.
-            level = torch.maximum(step[at], step[at + 1]).floor()
-            share = (level - step[at]) / (step[at + 1] - step[at])
-            inner.append(torch.sqrt(r[at] ** 2 + share * (r[at + 1] ** 2 - r[at] ** 2)))
+            level = torch.maximum(step[k], step[k + 1]).floor()
+            share = (level - step[k]) / (step[k + 1] - step[k])
+            inner.append(torch.sqrt(r[k] ** 2 + share * (r[k + 1] ** 2 - r[k] ** 2)))
     # Steps of different elements at the same radius, to rounding, count once.
     radii = torch.cat(inner).sort().values
     share = radii.detach() / R.detach()

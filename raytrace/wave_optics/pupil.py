@@ -16,13 +16,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_sqrt, value
+from raytrace.maths.numerics import Number, safe_sqrt, value
 from raytrace.psf_models.dft import phasor, sub_pixels
 from raytrace.psf_models.radial import is_centred
-from raytrace.wave_optics.element import is_smooth, path
+from raytrace.wave_optics.element import Pixels, is_smooth, path
 from raytrace.wave_optics.scene import WaveScene, aperture, millimetres, residual, spheres
 
 _MARGIN = 3  # cells beyond the aperture: half the points of the interpolation at its edge
+
+
+@value
+class ToPixels:
+    """Matrices of the transform from cells to the nodes of the pixels.
+
+    along_x: (W, X, N) or (D, W, X, N), along_y likewise, or if `folded` cosine and sine of one half of the points of
+    both axes, (2, W, X/2, N/2); pixel: (n,) weights of the nodes in a pixel of the sensor.
+    """
+
+    along_x: Tensor
+    along_y: Tensor
+    pixel: Tensor
+    folded: bool = False
 
 
 @value
@@ -30,19 +44,14 @@ class PupilSums:
     """Sums that do not depend on the heights: the matrices of the transform and the cells of the aperture.
 
     x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell, or behind the element as of
-    `behind_pixels`, where x and y are None; sphere: (D, N, N) mm or None where the matrices hold it; along_x: (W, X, N)
-    or (D, W, X, N), along_y likewise, or if `folded` cosine and sine of one half of the points of both axes,
-    (2, W, X/2, N/2); pixel: (n,) weights of the nodes in a pixel of the sensor.
+    `behind_pixels`, where x and y are None; sphere: (D, N, N) mm or None where the matrices hold it.
     """
 
     x: Tensor | None
     y: Tensor | None
     weight: Tensor
     sphere: Tensor | None
-    along_x: Tensor
-    along_y: Tensor
-    pixel: Tensor
-    folded: bool = False
+    to_pixels: ToPixels
 
 
 def prepare(scene: WaveScene, samples: int, nodes: int, *, extent: float = 1.0) -> PupilSums:
@@ -62,7 +71,7 @@ def prepare(scene: WaveScene, samples: int, nodes: int, *, extent: float = 1.0) 
     # dA cos θ/|x - u| = z dt² paraxially, z dt²/(1 - t²) for a true sphere.
     light = R.new_tensor(cells) * edge**2 * stretch**2 * z / (math.sqrt(math.pi) * R)
     light = light / wavelength[:, None, None]
-    return PupilSums(x, y, light, spheres(scene, x * x + y * y), *to_pixels(scene, t, nodes))
+    return PupilSums(x, y, light, spheres(scene, x * x + y * y), to_pixels(scene, t, nodes))
 
 
 def cells_at(scene: WaveScene, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -72,8 +81,8 @@ def cells_at(scene: WaveScene, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return z * t * stretch, z * t[:, None] * stretch, stretch
 
 
-def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> tuple[Tensor, Tensor, Tensor, bool]:
-    """From cells at t (N,) on both axes to the nodes of the pixels: along_x, along_y, pixel and folded of the sums."""
+def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> ToPixels:
+    """The matrices from cells at t (N,) on both axes to the nodes of the pixels."""
     u, v, pixel = sub_pixels(scene.grid, nodes)
     folded = is_centred(scene.grid)
 
@@ -86,7 +95,7 @@ def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> tuple[Tensor, Tensor, 
             cosine = torch.cat([0.5 * cosine[..., :1], cosine[..., 1:]], -1)
         return torch.stack([cosine, -wave.imag])
 
-    return along(u), along(v), pixel, folded
+    return ToPixels(along(u), along(v), pixel, folded)
 
 
 def prepare_pixels(
@@ -98,11 +107,12 @@ def prepare_pixels(
     """
     x, y, pitch = _lattice(scene, parts)
     u, v, pixel = sub_pixels(scene.grid, nodes)
-    along = [_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v))]
+    along_x, along_y = (_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v)))
     if behind is not None:
-        return PupilSums(None, None, behind, None, *along, pixel)
+        return PupilSums(None, None, behind, None, ToPixels(along_x, along_y, pixel))
     weight = _light_of_pixels(scene, x, y, pitch)
-    return PupilSums(*torch.broadcast_tensors(x, y[:, None]), weight, None, *along, pixel)
+    x, y = torch.broadcast_tensors(x, y[:, None])
+    return PupilSums(x, y, weight, None, ToPixels(along_x, along_y, pixel))
 
 
 def behind_pixels(scene: WaveScene, parts: int) -> Tensor:
@@ -115,6 +125,7 @@ def behind_pixels(scene: WaveScene, parts: int) -> Tensor:
 def _lattice(scene: WaveScene, parts: int) -> tuple[Tensor, Tensor, Tensor]:
     """Centres x (X,), y (Y,) mm of the cells of one map of pixels, and their pitch."""
     profile, R = scene.elements[0].profile, aperture(scene)
+    assert isinstance(profile, Pixels)  # as the plan has found
     pitch = profile.pitch / parts
     counts = (parts * cells_across(profile.pitch, n, R) for n in profile.heights.shape[::-1])
     x, y = (pitch * (torch.arange(n, dtype=R.dtype, device=R.device) - 0.5 * (n - 1)) for n in counts)
@@ -135,28 +146,27 @@ def _delayed(scene: WaveScene, weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 def intensity(scene: WaveScene, sums: PupilSums) -> Tensor:
     """Light per mm² (D, W, Y, X) at the nodes of the pixels, 1 = all through the aperture."""
-    if sums.x is None:
-        return light_of(scene, sums, sums.weight)
+    if sums.x is None or sums.y is None:
+        return light_of(scene, sums.to_pixels, sums.weight)
     if sums.sphere is None:
-        return light_of(scene, sums, _delayed(scene, sums.weight, sums.x, sums.y))
+        return light_of(scene, sums.to_pixels, _delayed(scene, sums.weight, sums.x, sums.y))
     waves = residual(scene, sums.x, sums.y, sums.sphere)
-    return light_of(scene, sums, sums.weight * phasor(waves / millimetres(scene)[:, None, None]))
+    return light_of(scene, sums.to_pixels, sums.weight * phasor(waves / millimetres(scene)[:, None, None]))
 
 
-def light_of(scene: WaveScene, sums, U: Tensor) -> Tensor:
+def light_of(scene: WaveScene, matrices: ToPixels, U: Tensor) -> Tensor:
     """|U|² (..., W, Y, X) at the nodes of the pixels, of light through cells (..., W, N, N).
 
-    sums: their matrices `along_x`, `along_y`, and whether they are `folded`, as of `PupilSums`: then the real and the
-    imaginary part are summed by real products of a quarter of the size,
+    If the matrices are `folded`, the real and the imaginary part are summed by real products of a quarter of the size,
 
         exp(-i(a + b)) = cos a cos b - sin a sin b - i (sin a cos b + cos a sin b)
 
     Cosines see the even part, sines the odd one, and the signs of a and b give the four quadrants.
     """
-    if not sums.folded:
-        U = sums.along_y @ U @ sums.along_x.mT
+    if not matrices.folded:
+        U = matrices.along_y @ U @ matrices.along_x.mT
         return U.real**2 + U.imag**2
-    (cos_y, sin_y), (cos_x, sin_x) = sums.along_y, sums.along_x
+    (cos_y, sin_y), (cos_x, sin_x) = matrices.along_y, matrices.along_x
     even, odd = _fold(torch.stack([U.real, U.imag]), -2)
     rows = [(_fold(along @ part, -1)) for along, part in ((cos_y, even), (sin_y, odd))]
     (cc, cs), (sc, ss) = ((e @ cos_x.mT, o @ sin_x.mT) for e, o in rows)
@@ -165,8 +175,9 @@ def light_of(scene: WaveScene, sums, U: Tensor) -> Tensor:
         both, cross = (a * a + b * b).sum(0), 2 * (a[0] * b[1] - a[1] * b[0])
         quadrants += [both + cross, both - cross]
     (pp, mm), (pm, mp) = quadrants[:2], quadrants[2:]  # signs of y, x
-    counts = (n * len(sums.pixel) for n in scene.grid.shape)  # of nodes along y and x
-    skip_y, skip_x = (2 * a.shape[-2] - n for a, n in zip((sums.along_y, sums.along_x), counts, strict=True))
+    counts = (n * len(matrices.pixel) for n in scene.grid.shape)  # of nodes along y and x
+    axes = matrices.along_y, matrices.along_x
+    skip_y, skip_x = (2 * along.shape[-2] - n for along, n in zip(axes, counts, strict=True))
     above, below = (torch.cat([m[..., skip_x:].flip(-1), p], -1) for m, p in ((pm, pp), (mm, mp)))
     return torch.cat([below[..., skip_y:, :].flip(-2), above], -2)
 
@@ -239,7 +250,7 @@ def _across_pixels(scene: WaveScene, centre: Tensor, u: Tensor, pitch: Tensor, i
     z, wavelength = scene.sensor_distance, millimetres(scene)[:, None, None]
     place, share = (pitch.new_tensor(a) / 2 for a in np.polynomial.legendre.leggauss(inner))
     curve = (0.5 * (1 / scene.depths + 1 / z)).reshape(-1, 1, 1, 1)
-    total = 0.0
+    total: Number = 0.0
     for p, s in zip(place, share, strict=True):
         x = centre + p * pitch
         total = total + s * phasor(curve * x**2 / wavelength) * phasor(-u[:, None] * x / z / wavelength)

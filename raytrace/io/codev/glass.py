@@ -1,6 +1,6 @@
 """Glasses of a CODE V sequence: of a catalog, by index and Abbe number, and private ones; read and written.
 
-NBK7_SCHOTT is the glass of that catalog whose name is the same but for hyphens and the like, which CODE V leaves out.
+NBK7_SCHOTT is the glass of the catalog SCHOTT whose name is NBK7 without its hyphens, blanks and points.
 517642 and 517.642, with any number of digits on either side of the point, give n_d - 1 and V_d; so does 1.517:64.2.
 PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
 """
@@ -75,8 +75,8 @@ class GlassLibrary(NamedTuple):
 def came_with(file: str, words: Sequence[str], user: Sequence[Path], report: Draft) -> list[Catalog]:
     """The catalogs in the folder of a file that words of glasses name, as MINE of NAME_MINE."""
     in_folder = catalogs_in_folder(file)
-    named = [name for word in words if (name := unquoted(word).rpartition("_")[2]).upper() in in_folder]
-    catalogs = catalogs_of_lens(named, user, report) if named else ()
+    names = [name for word in words if (name := unquoted(word).rpartition("_")[2]).upper() in in_folder]
+    catalogs = catalogs_of_lens(names, user, report) if names else ()
     return [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
 
 
@@ -85,17 +85,19 @@ def medium(word: str, library: GlassLibrary, *, place: Place, report: Draft) -> 
     name = unquoted(word)
     if report.substitutes.of(name) not in (None, FORMULA):
         glass = None if name.upper() in library.private else _figures(name, place)
-        numbers = None if glass is None or glass.formula != "model" else tuple(glass.coefficients.tolist()[:2])
-        sources = {"catalogs": library.came, "user": library.user, "place": place, "report": report}
-        return listed_glass(name, **sources, figures=numbers)
+        numbers = None
+        if glass is not None and glass.formula == "model":
+            nd, vd, _ = glass.coefficients.tolist()
+            numbers = nd, vd
+        return listed_glass(name, catalogs=library.came, user=library.user, place=place, report=report, figures=numbers)
     if name.upper() in library.private:
-        report.glass(place.surface, name, "private glass of the file (PRV)")
+        report.glass(place, name, "private glass of the file (PRV)")
         return library.private[name.upper()]
     if name.upper() == "AIR" or not name:
         return AIR
     figures = _figures(name, place)
     if figures is not None:
-        report.glass(place.surface, name, "nd and Vd by its digits, partial dispersion of the normal line")
+        report.glass(place, name, "nd and Vd by its digits, partial dispersion of the normal line")
         _refuse_estimates(name, *_fictitious_error(figures, library.wavelengths), place=place, report=report)
         return figures
     return _listed(name, library, place=place, report=report)
@@ -119,7 +121,7 @@ def _figures(name: str, place: Place) -> Glass | None:
 
 
 def _fictitious_error(glass: Glass, wavelengths: Sequence[float]) -> tuple[list[float], float]:
-    """Wavelengths beyond the lines F and C, and by how much an index there, estimated from n_d and V_d, may err.
+    """Wavelengths beyond the lines F and C, and the error of an index there that is estimated from n_d and V_d.
 
     The error is the difference from n² = 1 + B λ²/(λ² - C) of the same n_d and V_d. For 1,180 glasses of four makers at
     0.4047 µm its median is 3.9e-4; the estimate errs by 1.4e-4 (median) and 1.4e-3 (95 %).
@@ -254,7 +256,7 @@ def _table(
 def _table_error(glass: Glass, nodes: list[float], indices: list[float], waves: list[float]) -> float:
     """The error of a formula through indices at other wavelengths, estimated by the difference from another formula.
 
-    That has a term less; for three indices or fewer it is A + B/λ + C/λ^3.5, which is as good as Schott's.
+    The other formula has one term less; for three indices or fewer it is A + B/λ + C/λ^3.5, as accurate as Schott's.
     """
     if len(nodes) > 3:
         other = refractive_index(from_table(nodes, indices, terms=min(len(nodes), _TERMS) - 1), double(waves))
@@ -285,10 +287,9 @@ def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: P
     nd, vd, dpgf = exact_list(glass.coefficients, "model glass", place)
     if float(dpgf):
         raise LensFileError(f"a model glass with ΔPgF = {dpgf}, which a .seq file has no place for", place)
-    if is_code(glass.name) or _CODE.fullmatch(glass.name):
-        figures = _figures(glass.name, place).coefficients
-        if exact_list(figures, "model glass", place) == [nd, vd, dpgf]:
-            return glass.name
+    of_code = _figures(glass.name, place) if is_code(glass.name) or _CODE.fullmatch(glass.name) else None
+    if of_code and exact_list(of_code.coefficients, "model glass", place) == [nd, vd, dpgf]:
+        return glass.name
     if glass.name:
         message = f"a model glass named {glass.name!r}; a .seq file identifies model glasses by index and Abbe number"
         raise LensFileError(f"{message}: leave out the name", place)
@@ -296,7 +297,7 @@ def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: P
 
 
 def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
-    """The name of a private glass; one without a name gets one that is free."""
+    """The name of a private glass; a glass without a name gets a free name."""
     if not glass.name:
         same = (key for key, other in private.items() if not other.name and same_figures(other, glass))
         name = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)

@@ -59,7 +59,7 @@ RING = "RING"
 COMMENT = "!RAYTRACE"
 _COMMENT_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 
-#: Decentres and tilts by the numbers of a pose; those about x and y are left-handed, their sign turns.
+#: Decentres and tilts by the numbers of a pose; tilts about x and y are left-handed: their sign changes.
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
 LEFT_HANDED = ("ADE", "BDE")
 
@@ -190,7 +190,7 @@ def unquoted(word: str) -> str:
 
 
 class Stream:
-    """A file sorted, its commands read in their order as CODE V does: the system and the surfaces.
+    """The commands of a file in the order in which CODE V executes them, sorted: the system and the surfaces.
 
     private: private glasses by name; comments: those of this package.
     """
@@ -212,7 +212,8 @@ class Stream:
             self.report.met(f"{COMMENT.lower()} {word.lower()[:40]}", status, record.place)
             self.comments.append(record._replace(keyword=word, place=self._place(record)))
         elif self.in_catalog and record.keyword not in ("PWL", "END"):
-            name, waves = unquoted(_WORD.match(record.text.strip())[0]), self.system.last("PWL")
+            first, waves = _WORD.match(record.text.strip()), self.system.last("PWL")
+            name = unquoted(first[0]) if first else ""
             self.private[name.upper()] = record._replace(keyword=name, text=" ".join(waves.words if waves else ()))
             self.report.met("PRV", READ, record.place)
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
@@ -320,17 +321,17 @@ class Stream:
         self.in_catalog = record.keyword == "PRV"
 
     def _zoom(self, record: Record) -> None:
-        """The first of the zoom positions: the first of the values of a command that is zoomed."""
+        """Take the first zoom position: the first value of a zoomed command."""
         if not record.words or is_number(record.words[0]):
             self.system.records.setdefault("ZOO", []).append(record)
             return
         keyword = _keyword(record.words[0])
-        of = [word for word in record.words[1:] if _OF.fullmatch(word)]
+        places = [word for word in record.words[1:] if _OF.fullmatch(word)]
         values = [word for word in record.words[1:] if not _OF.fullmatch(word)]
         if keyword in (SYSTEM_READ | SURFACE_READ) - _HANDLED.keys() and values:
-            self._take_command(record._replace(keyword=keyword, words=(*of, values[0])))
+            self._take_command(record._replace(keyword=keyword, words=(*places, values[0])))
         elif keyword in REFUSED:
-            self._take_command(record._replace(keyword=keyword, words=(*of, *values[:1])))
+            self._take_command(record._replace(keyword=keyword, words=(*places, *values[:1])))
 
 
 _HANDLED = {

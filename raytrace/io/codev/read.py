@@ -87,14 +87,14 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     system = parts.system
     refuse_few(parts.surfaces)
     unit = _unit(system, report)
-    wave_words, source = _list(system, "WL") or (None, None)
-    if wave_words is None:
-        raise LensFileError("no wavelengths (WL)", system.place)
-    waves = [codev_glass.micrometres(word, source.place) for word in wave_words]
+    listed, place = _list(system, "WL"), system.place_of("WL")
+    if listed is None:
+        raise LensFileError("no wavelengths (WL)", place)
+    waves = [codev_glass.micrometres(word, place) for word in listed[0]]
     reference = system.last("REF")
     if reference is None and len(waves) > 1:
         message = f"no REF: the reference of the {len(waves)} wavelengths is not specified; add REF 1 to {len(waves)}"
-        raise LensFileError(message, source.place)
+        raise LensFileError(message, place)
     private = {name: codev_glass.private_glass(row, waves, report) for name, row in parts.private.items()}
     for name in {word.upper() for word in _comment_words(parts, "UNNAMED")} & private.keys():
         private[name] = dataclasses.replace(private[name], name="")
@@ -117,11 +117,11 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
     stop, aperture = _stop(parts.surfaces, report), _system_aperture(system, surfaces[0], unit)
     catalog_names = _comment_words(parts, "CATALOGS")
     if not any(record.keyword == "CATALOGS" for record in parts.comments):
-        catalog_names = dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog)
+        catalog_names = [*dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog)]
     title_words = title.words if title else ()
     draft = LensDraft(
         surfaces=focused,
-        stop=stop.surface,
+        stop=stop.surface or 0,
         aperture_kind=aperture[0],
         aperture=aperture[1],
         **_fields(system, unit, report),
@@ -133,7 +133,7 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
         catalogs=tuple(catalog_names),
         ray_aiming=_aiming(parts, report),
         afocal=_afocal(system),
-        sources={"stop": ("STO", stop), "aperture": aperture[2], "wavelengths": ("WL", source.place)},
+        sources={"stop": ("STO", stop), "aperture": aperture[2], "wavelengths": ("WL", place)},
     )
     for quantity, keyword in (("wavelength_weights", "WTW"), ("primary_wavelength", "REF")):
         if record := system.last(keyword):
@@ -148,7 +148,7 @@ def _afocal(system: Block) -> bool:
     record = system.last("AFI")
     answer = unquoted(record.words[0]).upper() if record and record.words else "Y"
     if answer not in ("Y", "YES", "N", "NO"):
-        raise LensFileError(f"AFI {answer}: expected Y or N, whether image space is afocal", record.place)
+        raise LensFileError(f"AFI {answer}: expected Y or N, whether image space is afocal", system.place_of("AFI"))
     return record is not None and answer.startswith("Y")
 
 
@@ -162,7 +162,7 @@ def _unit(system: Block, report: Draft) -> float:
 
 
 def _at_paraxial_image(surfaces: list[Surface], wavelength: Tensor, place: Place, report: Draft) -> list[Surface]:
-    """The image at its paraxial distance (PIM): the stored one, or the one of an axial ray where they differ."""
+    """The image at its paraxial distance (PIM): the stored distance, or that of an axial ray where they differ."""
     first, *others, image = surfaces
     n = signed(others, [refractive_index(surfaces[k].glass, wavelength) for k in medium_surfaces(surfaces)[:-1]])
     powers = [power(s, before, behind, wavelength) for s, before, behind in zip(others, n[:-1], n[1:], strict=True)]
@@ -183,7 +183,7 @@ def _stop(surfaces: Sequence[Block], report: Draft) -> Place:
     if not stops:
         report.warn("no STO: surface 1 is taken for the stop, as CODE V does", surfaces[1].place)
         return surfaces[1].place
-    stop = max(stops, key=lambda record: record.place.line)
+    stop = max(stops, key=lambda record: record.place.line or 0)
     if len(stops) > 1:
         report.warn(f"several stops (STO); the last, surface {stop.place.surface}, is used", stop.place)
     return stop.place
@@ -260,10 +260,11 @@ def _fields(system: Block, unit: float, report: Draft) -> dict:
 
 
 def _per_field(system: Block, keyword: str, count: int, default: float, report: Draft) -> list[float]:
-    values, record = _numbers(system, keyword, "value of a field") or ([default] * count, None)
+    listed = _numbers(system, keyword, "value of a field")
+    values = [default] * count if listed is None else listed[0]
     if len(values) < count:
         message = f"{keyword} has {len(values)} values for {count} fields; the others are taken as {default:g}"
-        report.warn(message, record.place)
+        report.warn(message, system.place_of(keyword))
     return (values + [default] * count)[:count]
 
 
@@ -348,7 +349,7 @@ def _surface(
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
     slope = block.number("CUY", "radius or curvature")  # 0 is a plane in both
-    is_radius = slope and block.last("CUY").keyword == "RDY"
+    is_radius = slope and any(record.keyword == "RDY" for record in block.all("CUY")[-1:])
     return Surface(
         thickness=_thickness(block, unit),
         curvature=nonzero(1.0 / (slope * unit) if is_radius else slope / unit),
@@ -385,7 +386,7 @@ def _conic_and_terms(block: Block, unit: float) -> dict:
         raise UnsupportedSurface(f"CUF {flat.words[0][:40]} (fraction of a curvature) is not modelled", flat.place)
     conic = block.number("K", "conic constant")
     if conic and kind == "SPH":
-        raise LensFileError("K on a sphere; put CON or ASP before it", block.last("K").place)
+        raise LensFileError("K on a sphere; put CON or ASP before it", block.place_of("K"))
     records = {j: record for j, letter in enumerate(LETTERS, 2) if (record := block.last(letter))}
     terms = {j: record.number(0, "coefficient") for j, record in records.items()}
     if kind == "ASP":
@@ -403,14 +404,14 @@ def _medium(block: Block, before: Glass, library: codev_glass.GlassLibrary, repo
     mode, glass = block.last("RMD"), block.last("GLA")
     word = unquoted(mode.words[0]).upper() if mode and mode.words else "REFR"
     if word not in ("REFL", "REFR"):
-        raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", mode.place)
-    place = glass.place if glass else block.place
+        raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", block.place_of("RMD"))
+    place = block.place_of("GLA")
     name = glass.words[0] if glass and glass.words else ""
     glass_behind = codev_glass.medium(name, library, place=place, report=report)
     if word == "REFR":
         return glass_behind
     if block.place.surface == 0:
-        raise LensFileError("the object is a mirror (REFL)", mode.place)
+        raise LensFileError("the object is a mirror (REFL)", block.place_of("RMD"))
     if name and glass_behind.name != before.name:
         message = f"a mirror followed by {shown(name)}, while light stays in {before.name or 'air'}"
         raise LensFileError(f"{message}; leave out the glass behind REFL", place)
@@ -451,7 +452,7 @@ def _phase(block: Block, radius: float, unit: float) -> RadialPhase | None:
 
 
 def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
-    """The pose of a surface and the one behind it, by decentres, tilts and their type: DAR, REV, BEN or none."""
+    """The pose of a surface and the pose behind it, by decentres, tilts and their type: DAR, REV, BEN or none."""
     numbers = {}
     for name, word in POSE_WORDS.items():
         factor = -1.0 if word in LEFT_HANDED else 1.0 if name.startswith("tilt") else unit
@@ -460,7 +461,7 @@ def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
     axes = POSE_TYPES[type_.keyword] if type_ else ONWARD
     if axes == BENT and sum(bool(value) for name, value in numbers.items() if name.startswith("tilt")) > 1:
         message = "BEN with tilts about several axes, to which CODE V adds one of its own, is not modelled"
-        raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", type_.place)
+        raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", block.place_of("POSE"))
     return poses_of(numbers, axes)
 
 

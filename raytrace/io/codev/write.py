@@ -45,7 +45,7 @@ from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import option
 
-#: Digits of a written coefficient of a phase, enough that it comes back through two roundings.
+#: Digits of a written coefficient of a phase, enough to read back the same number through two roundings.
 _DIGITS = 40
 
 #: Characters of a line, after which a list continues in the next.
@@ -59,7 +59,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     Raises LensFileError for data that a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰,
     apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
     """
-    place, private = Place(file), {}
+    place = Place(file)
+    private: dict[str, Glass] = {}
     surfaces = []
     for number, surface in enumerate(lens.surfaces):
         surfaces += _surface(lens, number, surface, private, catalogs, Place(file, None, number))
@@ -133,8 +134,8 @@ def _wrapped(words: Sequence[str]) -> str:
 def _aperture(aperture: SystemAperture, first: Surface, place: Place) -> str:
     keyword = SYSTEM_APERTURES.get(aperture.kind)
     if keyword is None or (keyword == "FNO" and not bool(torch.isinf(first.thickness).all())):
-        at = " of an object at a finite distance" if keyword else ""
-        message = f"the aperture {aperture.kind.replace('_', ' ')}{at}, which a .seq file does not hold"
+        where = " of an object at a finite distance" if keyword else ""
+        message = f"the aperture {aperture.kind.replace('_', ' ')}{where}, which a .seq file does not hold"
         raise LensFileError(f"{message}; set {option('entrance_pupil_diameter')} instead", place)
     return f"{keyword} {exact(aperture.value, 'system aperture', place)}"
 
@@ -174,9 +175,9 @@ def _cut(decentre: float, compression: float) -> tuple[str, str]:
 def _surface(
     lens: Lens, number: int, surface: Surface, private: dict[str, Glass], user: Sequence[Path], place: Place
 ) -> list[str]:
-    is_round = isinstance(surface.phase, RadialPhase)
+    radial = surface.phase if isinstance(surface.phase, RadialPhase) else None
     rest = dataclasses.replace(surface, before=None, after=None, is_break=False)
-    refuse_sag_terms(dataclasses.replace(rest, phase=None) if is_round else rest, place)
+    refuse_sag_terms(rest if radial is None else dataclasses.replace(rest, phase=None), place)
     last = len(lens.surfaces) - 1
     name = {0: "SO", last: "SI"}.get(number, "S")
     curvature = exact(surface.curvature, "curvature", place)
@@ -189,14 +190,14 @@ def _surface(
         f"  {COMMENT.lower()} break" if surface.is_break else "",
         *_poses(surface, place),
         *_shape(surface, place),
-        *(_phase(surface.phase, float(lens.primary), place) if is_round else []),
+        *([] if radial is None else _phase(radial, float(lens.primary), place)),
         *_apertures(surface.apertures, place),
         "" if surface.semi_diameter is None else f"  CIR EDG {exact(surface.semi_diameter, 'semi-diameter', place)}",
     ]
 
 
 def _medium(lens: Lens, number: int) -> Glass:
-    """The medium behind a surface, MIRROR for a mirror: behind a coordinate break the one before it."""
+    """The medium behind a surface, MIRROR for a mirror; behind a coordinate break, the medium before it."""
     while lens.surfaces[number].is_break:
         number -= 1
         while number and lens.surfaces[number].is_mirror:
@@ -206,14 +207,15 @@ def _medium(lens: Lens, number: int) -> Glass:
 
 def _poses(surface: Surface, place: Place) -> list[str]:
     """Decentres and tilts, and their type."""
-    pose, behind = surface.before, surface.after
+    pose, behind = surface.pose, surface.after
     if surface.is_break and behind is None and pose is not None and pose.tilts_first:
         pose, behind = None, pose
-    if pose is None and behind is None:
-        return []
-    if pose is None and behind.tilts_first:
-        return [*_pose(undone(behind), place), "  REV"]
-    if pose is not None and not pose.tilts_first:
+    if pose is None:
+        if behind is None:
+            return []
+        if behind.tilts_first:
+            return [*_pose(undone(behind), place), "  REV"]
+    elif not pose.tilts_first:
         if behind is None:
             return _pose(pose, place)
         if same(behind, undone(pose)):
@@ -286,15 +288,16 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         if aperture.shape == "circular" and aperture.extent[0] and (aperture.obscures or len(apertures) > 1):
             message = "a ring that obscures, or together with another aperture, which a .seq file does not hold"
             raise LensFileError(message, place)
-        of = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
+        label = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
         sizes, circle = aperture.extent, aperture.shape == "circular"
-        lines += _one_aperture(aperture, sizes[1:] if circle else sizes, of, place)
-        lines += _one_aperture(aperture, sizes[:1], f" OBS L'{RING}'", place) if circle and sizes[0] else []
+        lines += _edge(aperture, sizes[1:] if circle else sizes, label, place)
+        lines += _edge(aperture, sizes[:1], f" OBS L'{RING}'", place) if circle and sizes[0] else []
     return lines
 
 
-def _one_aperture(aperture: Aperture, sizes: Sequence[float], of: str, place: Place) -> list[str]:
+def _edge(aperture: Aperture, sizes: Sequence[float | Tensor], label: str, place: Place) -> list[str]:
+    """The commands of an aperture of sizes with a label."""
     numbers = [exact(size, "size of the aperture", place) for size in sizes]
     centre = [exact(number, "decentre of the aperture", place) for number in aperture.centre]
-    lines = [f"  {word}{of} {size}" for word, size in zip(APERTURES[aperture.shape], numbers, strict=True)]
-    return lines + [f"  AD{axis}{of} {number}" for axis, number in zip("XY", centre, strict=True) if float(number)]
+    lines = [f"  {word}{label} {size}" for word, size in zip(APERTURES[aperture.shape], numbers, strict=True)]
+    return lines + [f"  AD{axis}{label} {number}" for axis, number in zip("XY", centre, strict=True) if float(number)]

@@ -157,9 +157,10 @@ def _at_line(kind: str, line: str, *, capital: bool) -> Heading | None:
     return Heading(f"{kind} {line}") if line and (kind != "abbe" or line in "deD") else None
 
 
-def _merged(parts: list[Heading | None]) -> Heading | None:
-    """One meaning of several words or symbols of the same quantity, as 'Abbe number (νe)' and 'R [mm]'; else None."""
-    if None in parts:
+def _merged(meanings: list[Heading | None]) -> Heading | None:
+    """The meaning of several words or symbols of a quantity, as 'Abbe number (νe)' and 'R [mm]'; else None."""
+    parts = [part for part in meanings if part is not None]
+    if len(parts) < len(meanings):
         return None
     units = {part.unit for part in parts if part.unit}
     names = {part.name for part in parts if part.name}
@@ -242,14 +243,14 @@ def _check_units(cells: Sequence[str], headings: list[Heading | None], units: st
 def _settle_thickness(cells: list[str], names: list[str | None], place: Place, report: Draft) -> None:
     """d and D: the thickness if nothing else could be; D next to a named thickness is the diameter; else an error."""
     either = [k for k, name in enumerate(names) if name in ("d", "D")]
-    named = [cells[k] for k, name in enumerate(names) if name == "thickness"]
-    if len(either) + len(named) > 1 and not (named and len(either) == 1 and names[either[0]] == "D"):
-        listed = " and ".join(shown(cell) for cell in [*named, *(cells[k] for k in either)])
+    thicknesses = [cells[k] for k, name in enumerate(names) if name == "thickness"]
+    if len(either) + len(thicknesses) > 1 and not (thicknesses and len(either) == 1 and names[either[0]] == "D"):
+        listed = " and ".join(shown(cell) for cell in [*thicknesses, *(cells[k] for k in either)])
         raise LensFileError(f"columns {listed} could each be the thickness; write 'thickness' and 'diameter'", place)
     for k in either:
         if names[k] == "D":
-            report.note(f"column {shown(cells[k])} is taken as the {'diameter' if named else 'thickness'}")
-        names[k] = "diameter" if named else "thickness"
+            report.note(f"column {shown(cells[k])} is taken as the {'diameter' if thicknesses else 'thickness'}")
+        names[k] = "diameter" if thicknesses else "thickness"
 
 
 def _settle_lines(cells: list[str], names: list[str | None], place: Place) -> None:

@@ -110,15 +110,15 @@ def _medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
         return AIR
     if len(figures) == 1:
         line, value = indices.popitem()
-        at = "" if line == "d" else f" (given at {line})"
-        report.glass(place.surface, "", f"constant index {value!r}{at}")
+        of_line = "" if line == "d" else f" (given at {line})"
+        report.glass(place, "", f"constant index {value!r}{of_line}")
         return constant(value)
     if figures.keys() <= {"index d", "abbe d", "dpgf"} and "abbe d" in figures:
         numbers = tuple(figures.get(name, 0.0) for name in ("index d", "abbe d", "dpgf"))
     else:
         numbers = _fitted(indices, figures, place)
     written = "/".join(f"{value:.7g}" for value in numbers if value)
-    report.glass(place.surface, "", f"model glass {written} by {', '.join(figures)}")
+    report.glass(place, "", f"model glass {written} by {', '.join(figures)}")
     return model_glass(*numbers)
 
 
@@ -128,16 +128,16 @@ def _fitted(indices: dict[str, float], figures: dict[str, float], place: Place) 
     def at_lines(lines: Mapping[str, float]) -> dict[str, np.ndarray]:
         return {line: np.array([1.0, 1 / wave, wave**-3.5]) for line, wave in lines.items()}
 
-    at, model = at_lines(LINES), at_lines(MODEL_LINES)  # the model's are rounded
-    blue_red, violet_blue = at["F"] - at["C"], at["g"] - at["F"]
+    terms, model = at_lines(LINES), at_lines(MODEL_LINES)  # the model's are rounded
+    blue_red, violet_blue = terms["F"] - terms["C"], terms["g"] - terms["F"]
     dispersion, violet = model["F"] - model["C"], model["g"] - model["F"]
     normal = violet - 0.6438 * dispersion + 0.001682 * model["d"]
-    rows = [(at[line], value) for line, value in indices.items()]
+    rows = [(terms[line], value) for line, value in indices.items()]
     for name, value in figures.items():
         kind, _, line = name.partition(" ")
         if kind == "abbe":
-            span = at["F'"] - at["C'"] if line == "e" else blue_red
-            rows.append((value * span - at[line], -1.0))
+            span = terms["F'"] - terms["C'"] if line == "e" else blue_red
+            rows.append((value * span - terms[line], -1.0))
         elif kind == "pgf":
             rows.append((violet_blue - value * blue_red, 0.0))
         elif kind == "dpgf":
@@ -149,7 +149,7 @@ def _fitted(indices: dict[str, float], figures: dict[str, float], place: Place) 
     solution, *_ = np.linalg.lstsq(matrix / scale[:, None], wanted / scale, rcond=None)
     nd, spread = float(model["d"] @ solution), float(dispersion @ solution)
     for line, value in indices.items():
-        if abs(float(at[line] @ solution) - value) > 1e-4:
+        if abs(float(terms[line] @ solution) - value) > 1e-4:
             listed = ", ".join(f"{name} {value:g}" for name, value in figures.items())
             raise LensFileError(f"no glass has {shown(listed)}; is a column named wrongly?", place)
     if not (spread > 0 and nd > 1):
@@ -273,12 +273,14 @@ def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], re
     digits = digits if equals else text
     name = name.strip() if equals else ""
     if not equals and is_code(text):
-        report.glass(place.surface, text, "six-digit code: nd and Vd by its digits")
+        report.glass(place, text, "six-digit code: nd and Vd by its digits")
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in digits.split("/")):
         return _by_figures(name, digits, place, report)
-    d_line = [numbers.get(name) for name in ("index d", "abbe d")]
-    nearest = None if None in d_line else tuple(number(cell, "index or Abbe number", place) for cell in d_line)
+    nearest = None
+    if "index d" in numbers and "abbe d" in numbers:
+        index, abbe = (number(numbers[name], "index or Abbe number", place) for name in ("index d", "abbe d"))
+        nearest = index, abbe
     glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report, figures=nearest)
     for name, cell in numbers.items():
         kind, _, line = name.partition(" ")
@@ -296,7 +298,7 @@ def _by_figures(name: str, digits: str, place: Place, report: Draft) -> Glass:
         raise LensFileError(f"glass is {shown(digits)}, expected an index, nd/Vd or nd/Vd/ΔPgF", place)
     if nd == 1 and vd == 0 and not name:
         return AIR
-    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {digits}")
+    report.glass(place, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {digits}")
     return by_figures(nd, vd, dpgf, name)
 
 
@@ -304,13 +306,17 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     words = text.lower().split()
     obscures = words[0] == "obscuration"
     words = words[1:] if obscures else words
-    at = words.index("at") if "at" in words else len(words)
+    count = words.index("at") if "at" in words else len(words)  # of the words of the shape
     shape = SHAPES.get(words[0]) if words else None
-    if shape is None or at - 1 != (shape.sizes or at - 1) or len(words[at + 1 :]) != (2 if words[at:] else 0):
+    if (
+        shape is None
+        or count - 1 != (shape.sizes or count - 1)
+        or len(words[count + 1 :]) != (2 if words[count:] else 0)
+    ):
         expected = "expected for example 'circular 0 12.5' or 'rectangular 3 4'"
         raise LensFileError(f"aperture is {shown(text)}, {expected}", place)
-    sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:at])
-    x, y = [number(word, "centre of the aperture", place) * unit for word in words[at + 1 :]] or [0.0, 0.0]
+    sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:count])
+    x, y = [number(word, "centre of the aperture", place) * unit for word in words[count + 1 :]] or [0.0, 0.0]
     return clear_aperture(words[0], sizes, obscures, (x, y), f"aperture {shown(text)}", place)
 
 
@@ -401,10 +407,11 @@ def _with_object(surfaces: list[Surface], rows: list[Row], table: Table, unit: f
     """The surfaces with the object before them, at the distance of its row or of the header."""
     has_row = rows[0].place.surface == 0
     is_given = has_row and rows[0].cells.get("thickness", "-").lower() not in ("-", "nan", "none")
-    value, place = table.metadata.get("object distance", ("inf", None))
+    is_stated = "object distance" in table.metadata
+    value, place = table.metadata.get("object distance", ("inf", table.place))
     infinite = is_infinite(value) and not value.startswith("-")
     distance = torch.inf if infinite else number(value.removesuffix("mm").strip(), "object distance", place) * unit
-    if is_given and place and float(surfaces[0].thickness) != distance:
+    if is_given and is_stated and float(surfaces[0].thickness) != distance:
         raise LensFileError(f"object distance {value}, but the row of the object has another", place)
     if is_given:
         return surfaces
@@ -418,7 +425,7 @@ def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> l
     for row in rows[:-1]:
         if _IMAGE.search(row.cells.get("type", "")):
             raise LensFileError("rows after the image; expected the image in the last row", row.place)
-        if row.place.surface > 0 and "thickness" not in row.cells:
+        if row.place.surface and "thickness" not in row.cells:
             raise LensFileError("no thickness; expected a number (0 for surfaces in contact)", row.place)
     if rows[0].place.surface == 0 and len(rows) < 3:
         raise LensFileError("only object and image; expected a surface between them", last.place)
@@ -459,5 +466,5 @@ def _stop(rows: list[Row], table: Table) -> tuple[int, Place]:
         if len(marked) > 1:
             raise LensFileError(f"a second stop; surface {marked[0].surface} is the stop already", marked[1])
         if marked:
-            return marked[0].surface, marked[0]
+            return marked[0].surface or 0, marked[0]
     raise LensFileError("no row is the stop; call one 'Stop', or write the header line '# stop: 6'", table.place)

@@ -119,8 +119,8 @@ def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> tup
         return "image_f_number", DEFAULT_F_NUMBER
     value, place = table.metadata["aperture"]
     text = " ".join(value.replace("_", " ").replace("=", " ").split())
-    named = ((name, kind) for kind in APERTURE_KINDS if text.lower().startswith(name := kind.replace("_", " ")))
-    name, kind = next(named, ("", ""))
+    kinds = ((name, kind) for kind in APERTURE_KINDS if text.lower().startswith(name := kind.replace("_", " ")))
+    name, kind = next(kinds, ("", ""))
     size = text[len(name) :].strip()
     if not kind:
         number_behind = r"\s*((?:\d|\.|[+-]\s*\d).*|)"

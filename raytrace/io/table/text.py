@@ -102,7 +102,7 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
     extra = [cell.strip() for cell in cells[count:] if cell.strip()]
     if extra:
         raise LensFileError(f"{len(cells)} cells under {count} headings; {shown(extra[0])} has no column", place)
-    named: dict[str, str] = {}
+    cells_of_row: dict[str, str] = {}
     for heading, column, cell in zip(table.headings, table.columns, cells, strict=False):
         cell = plain_text(cell) if column == "comment" else " ".join(cell.split())
         if column == UNREAD and is_number(cell.replace(",", ".").strip("*")):
@@ -110,8 +110,8 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
             fix = f"name it, as radius, thickness, nd, Vd, conic, A4, or write the header line '# ignore: {heading}'"
             raise LensFileError(f"{message}; {fix}", place)
         if column and column != UNREAD and cell:
-            named[column] = f"{named[column]} {cell}" if column in named else cell
-    table.rows.append(Row(place, named))
+            cells_of_row[column] = f"{cells_of_row[column]} {cell}" if column in cells_of_row else cell
+    table.rows.append(Row(place, cells_of_row))
 
 
 def _is_metadata(line: str) -> bool:
@@ -249,13 +249,16 @@ _EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}(?:[eE][+-]?\d+)?")
 
 def is_figure(column: str) -> bool:
     """True for a column of numbers."""
-    named = ("radius", "thickness", "curvature", "conic", "semi_diameter", "diameter", "pgf", "dpgf")
-    named += ("temperature", "pressure")
-    return column in named or column.startswith(("index ", "abbe ")) or order(column) is not None
+    numeric = ("radius", "thickness", "curvature", "conic", "semi_diameter", "diameter", "pgf", "dpgf")
+    return (
+        column in (*numeric, "temperature", "pressure")
+        or column.startswith(("index ", "abbe "))
+        or order(column) is not None
+    )
 
 
 def plain(text: str) -> str:
-    """A number in ASCII: full-width digits, other minus signs and marks such as * taken away."""
+    """A number in ASCII: without full-width digits, other minus signs and marks such as *."""
     text = unicodedata.normalize("NFKC", text).translate(_MINUS).strip(" *†‡")
     text = re.sub(r"^([+-])\s+(?=[\d.])", r"\1", text)
     return "-" if text and not text.strip("-") else text

@@ -59,7 +59,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row["conic"] = exact(surface.conic, "conic constant", place)
     if surface.semi_diameter is not None:
         row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
-    if kind is not None:
+    if kind is not None and surface.coefficients is not None:
         terms = exact_list(surface.coefficients, "aspheric terms", place)
         row |= {f"a{kind.step * j}": term for j, term in enumerate(terms, 1)}
     if surface.apertures:

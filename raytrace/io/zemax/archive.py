@@ -100,7 +100,8 @@ def read(
     lens_member = _lens(packed_files, file)
     place = Place(f"{file} ({lens_member.name})")
     text = decode(unpacked(lens_member, MAX_BYTES, place), place)
-    used, left = set(), [MAX_CATALOGS]
+    used: set[str] = set()
+    left = [MAX_CATALOGS]
     packed = {
         member.stem: (f"{member.name} of the archive", partial(_catalog, member, used, left))
         for member in packed_files
@@ -125,16 +126,17 @@ def read(
 
 def members(content: bytes, place: Place) -> list[Member]:
     """The files of an archive, in its order. Raises LensFileError where it is damaged or cut off."""
-    packed_files, at, whole = [], 0, memoryview(content)
-    while at < len(whole):
-        layout = _LAYOUTS.get(whole[at])
+    packed_files: list[Member] = []
+    end, whole = 0, memoryview(content)  # end: of the members so far
+    while end < len(whole):
+        layout = _LAYOUTS.get(whole[end])
         if layout is None:
-            start = bytes(whole[at : at + 2]).hex(" ")
+            first = bytes(whole[end : end + 2]).hex(" ")
             known = " or ".join(f"{byte:02x}" for byte in _LAYOUTS)
-            message = f"member {len(packed_files)} begins with {start} at byte {at}, expected {known}: a .zar file?"
+            message = f"member {len(packed_files)} begins with {first} at byte {end}, expected {known}: a .zar file?"
             raise LensFileError(message, place)
-        header = bytes(whole[at : at + layout.length])
-        start, size = at + layout.length, int.from_bytes(header[layout.size], "little")
+        header = bytes(whole[end : end + layout.length])
+        start, size = end + layout.length, int.from_bytes(header[layout.size], "little")
         if len(header) < layout.length or size > len(whole) - start:
             left = max(0, len(whole) - start)
             raise LensFileError(
@@ -147,7 +149,7 @@ def members(content: bytes, place: Place) -> list[Member]:
         name = "".join(c if c.isprintable() else "?" for c in name)[:100] or "(no name)"
         packed = name.upper().endswith(".LZW")
         packed_files.append(Member(name[:-4] if packed else name, packed, whole[start : start + size]))
-        at = start + size
+        end = start + size
     return packed_files
 
 
@@ -169,6 +171,7 @@ def unpacked(member: Member, most: int, place: Place) -> bytes:
         if before:
             starts.append(len(out) - before)
             lengths.append(before + 1)
+        word: bytes | bytearray
         if code < 256:
             word = singles[code]
         elif code - 256 < len(starts):
@@ -193,11 +196,11 @@ def _too_large(member: Member, most: int, place: Place) -> LensFileError:
 
 
 def _lens(packed_files: Sequence[Member], file: str) -> Member:
-    """The one lens of an archive, or among several the one with the archive's name."""
+    """The only lens of an archive, or among several lenses that of the archive's name."""
     lenses = [member for member in packed_files if member.suffix == ".zmx"]
-    named = [member for member in lenses if member.stem == Path(file).stem.upper()]
-    if len(lenses) == 1 or len(named) == 1:
-        return lenses[0] if len(lenses) == 1 else named[0]
+    of_name = [member for member in lenses if member.stem == Path(file).stem.upper()]
+    if len(lenses) == 1 or len(of_name) == 1:
+        return lenses[0] if len(lenses) == 1 else of_name[0]
     listed = ", ".join(member.name for member in (lenses or packed_files)[:8]) + (
         ", …" if len(lenses or packed_files) > 8 else ""
     )

@@ -10,8 +10,8 @@ reported.
 
 Temperature and pressure: ENVD gives those of the lens (°C, atm, and whether indices follow them; 0: those of the
 catalogs). TEMP and PRES of the multi-configuration table hold for the surfaces that the operands after them name (CRVT,
-THIC, GLSS), up to the next one of the same name; the last is the lens's own, which ENVD repeats. With this rule the
-stored image distance of OpticStudio's sample of an evacuated cell is reproduced to 4e-12 mm.
+THIC, GLSS), up to the next operand of the same name; the last sets the environment of the lens, as ENVD. With this rule
+the stored image distance of OpticStudio's sample of an evacuated cell is reproduced to 4e-12 mm.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,7 +48,6 @@ from raytrace.io.zemax.surfaces import (
     AIMING,
     AIMINGS,
     GLASS,
-    INVERSE,
     NUMBER,
     ROWS,
     SIZE,
@@ -140,7 +139,8 @@ _CELL = re.compile(r'\s*(-?\d{1,6})\s+(-?\d{1,6})\s+("[^"]*"|\S+)(.*)', re.ASCII
 
 def _cells(records: Iterable[Record], count: int, report: Draft) -> list[Cell]:
     """The cells of the lines after MNUM, every line reported."""
-    cells, row, before = [], 0, (None, 0)
+    cells: list[Cell] = []
+    row, before = 0, (("", 0, 0), 0)
     for record in records:
         match, word = _CELL.fullmatch(record.text), record.keyword
         if not match or not re.fullmatch(r"[A-Z][A-Z0-9]{3}", word):
@@ -218,10 +218,7 @@ class PlacedOperand(NamedTuple):
 
 
 def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens, list[Vary | Solve]]:
-    """The lens, as its surfaces are stored, with its operands, and in the requested configuration.
-
-    And the variables and pickups of the numbers that its operands set.
-    """
+    """The lens with its operands, in the stored or the requested configuration; variables and pickups of operands."""
     sections, lens = file.sections, file.lens
     head = sections.system.last("MNUM")
     if head is None:
@@ -229,7 +226,7 @@ def read(file: LensFile, report: Draft, configuration: int | None) -> tuple[Lens
     count = head.integer(0, "number of configurations", 1)
     if not 1 <= count <= MOST_CONFIGURATIONS:
         raise LensFileError(f"MNUM is {count}, expected 1 to {MOST_CONFIGURATIONS} configurations", head.place)
-    behind = [record for record in sections.tail if record.place.line > head.place.line]
+    behind = sections.tail[sum((record.place.line or 0) <= (head.place.line or 0) for record in sections.tail) :]
     tail = [record for record in behind if record.keyword not in TOLERANCES]
     groups = _grouped(_cells(tail, count, report), count, report)
     stated = head.integer(1, "active configuration", 0) if count > 1 else 1
@@ -285,54 +282,62 @@ def _rules(operands: Sequence[PlacedOperand], lens: Lens) -> Iterator[Vary | Sol
     for index, (operand, cells, _) in enumerate(operands):
         path = operand.paths[0].path if operand.paths else ()
         number, name = cells[0].number, ""
-        if len(path) > 2 and path[0] == "surfaces":  # the quantity of that surface
+        if len(path) > 2 and path[0] == "surfaces" and isinstance(path[1], int):  # the quantity of that surface
             names = {place.steps: name for name, place in parameter_paths(lens.surfaces[path[1]]).items()}
             number, name = path[1], names.get(path[2:], "thickness" if path[2] == "thickness" else "")
         for k, cell in enumerate(cells, 1):
             status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
             if not status or cell.configuration != k:
                 continue
-            where = {"configuration": k, "operand": index}
+            where: dict[str, Any] = {"configuration": k, "operand": index}
             if status == VARIABLE:
                 yield Vary(number, name, **where) if name else Solve(cell.number, cell.name, "variable", **where)
                 continue
             numbers = [plain(word) if is_number(word) else 0.0 for word in cell.rule[3:7]]
             source, row, scale, offset = (*numbers, *(0.0, 0.0, 1.0, 0.0)[len(numbers) :])
             followed = (float(indices[int(row)]),) if row == int(row) and int(row) in indices else ()
-            pickup = {"numbers": followed, "source": int(source), "scale": scale, "offset": offset}
-            yield Solve(cell.number, name or cell.name, STATUSES.get(status, f"status {status}"), **pickup, **where)
+            kind = STATUSES.get(status, f"status {status}")
+            yield Solve(cell.number, name or cell.name, kind, followed, int(source), scale, offset, **where)
 
 
 def _with_environments(lens: Lens, covering: Sequence[Cell]) -> Lens:
     """The lens with the environments of surfaces, which only operands give: cells of TEMP and PRES."""
+    if lens.environment is None:
+        return lens
     surfaces = list(lens.surfaces)
-    for cell in covering if lens.environment is not None else ():
+    for cell in covering:
         value = number(cell.value, cell.name, cell.record.place)
-        for k in cell.covered:
+        for k in cell.covered or ():
             if 0 <= k < len(surfaces):
-                air = surfaces[k].environment or lens.environment
-                air = dataclasses.replace(air, **{ENVIRONMENT_OPERANDS[cell.name]: double(value)})
-                environment_at((float(air.temperature), float(air.pressure)), cell.record.place)
+                air = _with_quantity(surfaces[k].environment or lens.environment, cell, value)
                 surfaces[k] = dataclasses.replace(surfaces[k], environment=air)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def _with_quantity(air: Environment, cell: Cell, value: float) -> Environment:
+    """An environment with the temperature or pressure of a cell. Raises LensFileError out of range."""
+    changed = {ENVIRONMENT_OPERANDS[cell.name]: double(value)}
+    air = dataclasses.replace(air, **changed)
+    environment_at((float(air.temperature), float(air.pressure)), cell.record.place)
+    return air
 
 
 def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | None:
     """Whether the lens as stored holds the operand of a configuration; None where that cannot be decided.
 
-    Operands are saved with 13 digits. A semi-diameter of 0 is left to be computed.
+    Operands are saved with 13 digits. A semi-diameter of 0 is automatic.
     """
     operand, k = placed.operand, configuration - 1
     if not operand.paths:
         return None
     stored = part(lens, operand.paths[0].path)
     if operand.numbers is None:
-        wanted = operand.media[k] if operand.media else operand.words[k][0]
+        wanted: Any = operand.media[k] if operand.media else operand.words[k][0]
         if operand.name == "SDIA":
             return None if wanted is None else stored is not None and abs(stored - wanted) <= 1e-9 * wanted
         return same(stored, wanted)
-    number, wanted = 0.0 if stored is None else float(stored), float(operand.numbers[k])
-    return number == wanted or abs(number - wanted) <= 1e-9 * abs(wanted)
+    held, number = 0.0 if stored is None else float(stored), float(operand.numbers[k])
+    return held == number or abs(held - number) <= 1e-9 * abs(number)
 
 
 # -- an operand, placed -----------------------------------------------------------------------------------------------
@@ -343,7 +348,7 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
     first, values = cells[0], tuple(cell.value for cell in cells)
     texts = tuple((value,) for value in values)
 
-    def placed(like: Lens = file.lens, **fields) -> PlacedOperand:
+    def placed(like: Lens = file.lens, **fields: Any) -> PlacedOperand:
         return PlacedOperand(Operand(first.name, first.number, first.parameter, **fields), cells, like)
 
     unplaced = placed(words=texts)
@@ -355,14 +360,14 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
         return placed(words=texts, refusal=_REFUSED[first.name])
     row, last = ROWS[first.name], len(file.lens.surfaces) - 1
     try:
-        for k in (first.number,) if row.of == "surface" else first.covered or ():
+        for k in (first.number,) if row.argument == "surface" else first.covered or ():
             if not 0 <= k <= last:
                 raise LensFileError(f"{first.name} of surface {k}; expected one from 0 to {last}", first.record.place)
         if row.keyword == "XDAT" and _is_of_terms(first.parameter, file.surfaces[first.number].row):
-            words = [_terms(cell, file) for cell in cells]
-            names = [name for name in ("coefficients", "sag_terms", "phase") if any(name in each for each in words)]
+            fields = [_terms(cell, file) for cell in cells]
+            names = [name for name in ("coefficients", "sag_terms", "phase") if any(name in each for each in fields)]
             paths = tuple(ScaledPath(("surfaces", first.number, name)) for name in names)
-            return placed(paths=paths, words=tuple(tuple(map(each.get, names)) for each in words))
+            return placed(paths=paths, words=tuple(tuple(map(each.get, names)) for each in fields))
         paths, like = _paths_of_parameter(first, row, file) if not row.path else _paths(first, row, file)
         if not paths:
             return unplaced
@@ -388,17 +393,17 @@ def _placed_operand(cells: tuple[Cell, ...], file: LensFile) -> PlacedOperand:
 
 
 def _paths(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[ScaledPath, ...], Lens]:
-    """The path of a row and those that follow it, none of a value that the lens lacks; and a lens that models them."""
+    """The paths of a row's value and of those that follow it, none where the lens lacks it; a lens that models them."""
     lens, k, path = file.lens, cell.number, row.path_in_lens(cell.number)
     paths, like = [path], lens
     if row.path.startswith("environment"):
         paths = _environment_paths(cell, path, lens)
-    elif row.of in ("field", "wavelength"):
-        count = len(lens.fields.x if row.of == "field" else lens.wavelengths)
+    elif row.argument in ("field", "wavelength"):
+        count = len(lens.fields.x if row.argument == "field" else lens.wavelengths)
         paths = paths if 1 <= k <= count else []
         if "vignetting" in path and lens.fields.vignetting is None:
             like = with_part(lens, ("fields", "vignetting"), lens.fields.x.new_zeros(5, count))
-    elif row.of == "":
+    elif row.argument == "":
         paths += [("aperture", "value")] if row.path == "stop" and lens.aperture.kind == "float_by_stop" else []
     else:
         return _paths_in_surface(cell, row, file)
@@ -422,15 +427,16 @@ def _paths_in_surface(cell: Cell, row: ValueRow, file: LensFile) -> tuple[tuple[
     paths, like = [ScaledPath(path)], lens
     if row.kind == GLASS:
         record = block.last("GLAS")
-        if row.word > 1 and record is None:
-            raise LensFileError(f"{cell.name} of surface {k}, which has no glass", cell.record.place)
-        if row.word > 1 and not is_blank(record) and record.integer(1, "flag", 0) != 1:
-            return (), lens
+        if row.word > 1:
+            if record is None:
+                raise LensFileError(f"{cell.name} of surface {k}, which has no glass", cell.record.place)
+            if not is_blank(record) and record.integer(1, "flag", 0) != 1:
+                return (), lens
         paths += _picked_up(paths, file)[0] if row.word == 1 else []
     elif row.keyword == "SCBD" and part(lens, path[:-1]) is None:
-        side = _numbered(block, "SCBD", {"before": "1", "after": "2"}[path[2]])
+        side = _numbered(block, "SCBD", "1" if path[2] == "before" else "2")
         pose = Pose(tilts_first=bool(side and side.number(1, "order", 0.0)))
-        like = with_part(lens, path[:-1], dataclasses.replace(pose, **{path[-1]: double(0.0)}))
+        like = with_part(with_part(lens, path[:-1], pose), path, double(0.0))
     elif row.keyword == "DIAM":  # followed by a floating aperture, irregular terms and the size of the stop
         apertures = block.all(*aperture_keywords())
         floats = bool(apertures) and apertures[-1].keyword == "FLAP"
@@ -478,7 +484,7 @@ def _solves(file: LensFile) -> list[Solve]:
 def _picked_up(paths: Sequence[ScaledPath], file: LensFile) -> tuple[list[ScaledPath], dict[int, Surface]]:
     """The paths of pickups of a value, from the object on, as a pickup looks back; and surfaces that model them.
 
-    A pickup whose stored value is not its rule's stays unchanged: it has another meaning.
+    A pickup whose stored value differs from its rule is left out: its meaning is not known.
     """
     followed, likes = {scaled.path: scaled for scaled in paths}, {}
     for solve in (rule for rule in _solves(file) if rule.kind == "pickup"):
@@ -511,10 +517,12 @@ def _numbered(block: Block, keyword: str, number: str) -> Record | None:
 # -- values -----------------------------------------------------------------------------------------------------------
 
 
-def power_of(row: ValueRow, lens: Lens) -> int:
-    """The power of length in the value of a row, which of fields and of the aperture depends on their kind."""
+def power_of(row: ValueRow, lens: Lens) -> int | None:
+    """The power of length in the value of a row; that of fields and of the aperture depends on their kind."""
     is_length = lens.aperture.kind in ("entrance_pupil_diameter", "float_by_stop")
-    has_none = (row.of == "field" and lens.fields.kind == "angle") or (row.path == "aperture.value" and not is_length)
+    has_none = (row.argument == "field" and lens.fields.kind == "angle") or (
+        row.path == "aperture.value" and not is_length
+    )
     return 0 if has_none else row.power
 
 
@@ -529,21 +537,20 @@ def _number(cell: Cell, row: ValueRow, file: LensFile) -> float:
         raise LensFileError(f"{cell.name} is {shown(text)}; only the object may be at infinity", place)
     value, power = number(text, label, place), power_of(row, file.lens)
     if not row.path:
-        kind, numbers = file.surfaces[cell.number].row, file.surfaces[cell.number].numbers
-        power = kind.power(row.keyword, cell.parameter)
+        power = file.surfaces[cell.number].row.power(row.keyword, cell.parameter)
     try:
-        value = inverse(text, file.millimetres) if power is INVERSE else in_millimetres(value, power, file.millimetres)
+        value = inverse(text, file.millimetres) if power is None else in_millimetres(value, power, file.millimetres)
     except OverflowError as error:
         raise LensFileError(f"{label} is {shown(text)}, too small a length", place) from error
     if not math.isfinite(value):
         raise LensFileError(f"{label} is {shown(text)}, too large once converted to mm", place)
     if row.keyword == "PARM":
+        kind, numbers = file.surfaces[cell.number].row, file.surfaces[cell.number].numbers
         changed = numbers._replace(parameters={**numbers.parameters, cell.parameter: value})
         if objection := kind.objection(changed):
             raise LensFileError(objection, place)
     if row.path.startswith("environment") and file.lens.environment is not None:
-        air = dataclasses.replace(file.lens.environment, **{row.path_in_lens(0)[-1]: double(value)})
-        environment_at((float(air.temperature), float(air.pressure)), place)
+        _with_quantity(file.lens.environment, cell, value)
     if row.path in ("wavelengths", "aperture.value") and value <= 0:
         raise LensFileError(f"{label} is {shown(text)}, expected a positive number", place)
     if row.path == "wavelength_weights" and value < 0:
@@ -555,7 +562,7 @@ def _medium(cell: Cell, row: ValueRow, file: LensFile) -> Glass:
     """The medium of a name, or of the stored model glass with another index, Abbe number or partial dispersion."""
     record = file.sections.surfaces[cell.number].last("GLAS")
     place = cell.record.place._replace(surface=cell.number)
-    if row.word > 1:
+    if row.word > 1 and record:
         words = [*record.words, *["0"] * (row.word - len(record.words))]
         words[row.word - 1] = cell.value
         return file.medium(Record("GLAS", tuple(words), "", place))
@@ -595,10 +602,11 @@ def _words(cell: Cell, row: ValueRow, file: LensFile, paths: Sequence[ScaledPath
         if row.path == "primary_wavelength" and 1 <= whole <= len(lens.wavelengths):
             return (whole,)
         if row.path == "stop" and 0 < whole < last:
-            size = lens.surfaces[whole].semi_diameter
-            if len(paths) > 1 and not size:
+            if len(paths) == 1:
+                return (whole,)
+            if not (radius := lens.surfaces[whole].semi_diameter):
                 raise LensFileError("FLOA (float by stop size), but the stop surface has no DIAM", place)
-            return (whole, *([double(size)] if len(paths) > 1 else []))
+            return whole, double(radius)
         most = {"stop": f"a surface from 1 to {last - 1}", "ray_aiming": "0 (off), 1 (paraxial) or 2 (real)"}
         expected = most.get(row.path, f"1 to {len(lens.wavelengths)}, the number of wavelengths")
         raise LensFileError(f"{cell.name} is {shown(cell.value)}; expected {expected}", place)
@@ -610,7 +618,7 @@ def _words(cell: Cell, row: ValueRow, file: LensFile, paths: Sequence[ScaledPath
         return (size,)
     if size < 0 or (not size and any(isinstance(part(lens, path), Tensor) for path, *_ in paths[1:])):
         raise LensFileError(f"{cell.name} is {shown(cell.value)}, expected a semi-diameter above 0", place)
-    sizes = [size or None]
+    sizes: list[Any] = [size or None]
     for path, *_ in paths[1:]:  # a floating aperture of an automatic semi-diameter keeps its own size
         sizes.append(double(size) if isinstance(part(lens, path), Tensor) else size or part(lens, path))
     return tuple(sizes)
@@ -660,16 +668,16 @@ def _report_solved(sections: Sections, operands: Sequence[PlacedOperand], active
     for block in sections.surfaces:
         curvature = block.last("CURV")
         if curvature and len(curvature.words) > 1 and curvature.words[1] not in ("0", "1", "4"):
-            solved.append(("CRVT", block.place.surface))
+            solved.append(("CRVT", block.surface))
         if block.last("MAZH"):
-            solved.append(("THIC", block.place.surface))
+            solved.append(("THIC", block.surface))
     listed = [placed.operand for placed in operands]
     set_by_operands = {(operand.name, operand.number) for operand in listed}
     left = [f"{ROWS[name].keyword} of surface {k}" for name, k in solved if (name, k) not in set_by_operands]
     varying = (operand.values() for operand in listed if refracts(operand))
     if left and any(value != values[0] for values in varying for value in values):
         message = f"solved for configuration {active}, and unchanged in the others: {', '.join(left)}"
-        report.warn(message, sections.system.last("MNUM").place)
+        report.warn(message, sections.system.place_of("MNUM"))
 
 
 # -- the environment, read --------------------------------------------------------------------------------------------
@@ -718,20 +726,23 @@ def is_of_surfaces(operand: Operand) -> bool:
 def with_environments(lens: Lens, place: Place) -> Lens:
     """The lens with operands that give the environments of its surfaces.
 
-    Raises LensFileError where the lens has none itself, for indices then follow none in such a file.
+    Raises LensFileError for a lens without an environment: the indices of its file follow none.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if s.environment is not None and not _is_set(lens, k)]
     if lens.environment is None and missing:
         message = "a surface in an environment of its own, of a lens without one; give it one, as lens.at(pressure=1)"
         raise LensFileError(message, place._replace(surface=missing[0]))
     added = [operand for k in missing for operand in (*_environment_operands(lens, "surfaces", k), _naming(lens, k))]
-    listed = []
+    listed: list[Operand] = []
     for position, operand in enumerate(candidates := [*added, *lens.operands]):
         listed.append(operand)
         if is_of_surfaces(operand):  # is followed by operands that name its surfaces
-            behind = itertools.takewhile(lambda o, name=operand.name: o.name != name, candidates[position + 1 :])
-            named = {other.number for other in behind if other.name in _NAMING}
-            listed += [_naming(lens, path[1]) for path, *_ in operand.paths if path[1] not in named]
+            names = [other.name for other in candidates[position + 1 :]]
+            count = names.index(operand.name) if operand.name in names else len(names)
+            behind = candidates[position + 1 : position + 1 + count]
+            surfaces = {other.number for other in behind if other.name in _NAMING}
+            covered = [k for (_, k, *_), *_ in operand.paths if isinstance(k, int)]
+            listed += [_naming(lens, k) for k in covered if k not in surfaces]
     for name, last in zip(ENVIRONMENT_OPERANDS, _environment_operands(lens) if lens.environment else (), strict=False):
         of_name = [operand for operand in listed if operand.name == name]
         listed += [last] if of_name and is_of_surfaces(of_name[-1]) else []
@@ -739,7 +750,7 @@ def with_environments(lens: Lens, place: Place) -> Lens:
 
 
 def _is_set(lens: Lens, k: int) -> bool:
-    """Whether operands of the lens set the environment of a surface; the quantities they do not set are the lens's."""
+    """Whether operands of the lens set the environment of a surface, and all other quantities are those of the lens."""
     if lens.environment is None:
         return False
     held = {path for operand in lens.operands for path, *_ in operand.paths}

@@ -25,7 +25,7 @@ import dataclasses
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -134,7 +134,7 @@ class TypedSurface(NamedTuple):
 
     @property
     def number(self) -> int:
-        return self.block.place.surface
+        return self.block.surface
 
     def names(self, keyword: str, j: int) -> dict[str, float]:
         """The numbers of the lens that PARM j, or XDAT j, gives, by their names, each with its factor."""
@@ -163,13 +163,12 @@ class TypedSurface(NamedTuple):
 
     def pickup(self, quantity: str, source: int, scale: float, offset: float = 0.0, other: str = "") -> Solve:
         """scale times a quantity of a surface, the same one unless another is named, plus an offset."""
-        pickup = {"source": source, "scale": scale, "offset": offset, "quantity_of_source": other}
-        return Solve(self.number, quantity, "pickup", **pickup)
+        return Solve(self.number, quantity, "pickup", (), source, scale, offset, other)
 
-    def has(self, quantity: str, record: Record, report: Draft) -> bool:
+    def has(self, quantity: str, keyword: str, report: Draft) -> bool:
         if quantity not in self.row.holds:
             message = f"a surface that is {self.row.name} has no {quantity}; left out"
-            report.note(f"{record.place}: {record.keyword}: {message}")
+            report.note(f"{self.block.place_of(keyword)}: {keyword}: {message}")
         return quantity in self.row.holds
 
 
@@ -178,10 +177,10 @@ def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft)
     block = typed.block
     for j, record in typed.numbered("PPAR"):
         yield from _parameter_pickup(typed, j, record, surfaces)
-    if (code := typed.code("CURV")) and typed.has("curvature", block.last("CURV"), report):
+    if (code := typed.code("CURV")) and typed.has("curvature", "CURV", report):
         yield _curvature_rule(typed, code)
     yield from _thickness_rules(typed)
-    if (record := block.last("VCON")) and typed.has("conic", record, report):
+    if block.last("VCON") and typed.has("conic", "VCON", report):
         yield Vary(typed.number, "conic")
     for j, _ in typed.numbered("VPAR"):
         yield from _parameter_variable(typed, "PARM", j)
@@ -191,8 +190,9 @@ def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft)
         elif code:
             yield typed.solve(f"XDAT {j}", f"code {code}", _solve_numbers(record, 3))
     if (code := typed.code("GLAS")) == _MODEL:
+        glass = block.last("GLAS")
         for k, name in _GLASS_NUMBERS.items():
-            if block.last("GLAS").number(k, "status", 0.0) == VARIABLE:
+            if glass and glass.number(k, "status", 0.0) == VARIABLE:
                 yield Vary(typed.number, name)
     elif code:
         yield typed.coded("glass", "GLAS", _GLASS_RULES)
@@ -200,8 +200,10 @@ def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft)
         yield typed.coded("semi_diameter", "DIAM", _SEMI_DIAMETER_RULES)
 
 
-def _solve_numbers(record: Record, first: int) -> list[float]:
-    """The numbers of a solve, from a word on, without a name in quotation marks."""
+def _solve_numbers(record: Record | None, first: int) -> list[float]:
+    """The numbers of a solve, from a word on, without a name in quotation marks; none without a record."""
+    if record is None:
+        return []
     return [record.number(k, "number of a solve") for k in range(first, len(record.words)) if record.words[k][0] != '"']
 
 
@@ -216,8 +218,8 @@ def _scaled(numbers: list[float], row: SolveRow, millimetres: float) -> list[flo
 
 def _with_offset(numbers: list[float], power: int | None, millimetres: float) -> list[float]:
     """Surface, factor, offset and further numbers, with the offset in mm."""
-    power = 1 if power is INVERSE else power
-    return [in_millimetres(n, power, millimetres) if k == 2 else n for k, n in enumerate(numbers)]
+    exponent = 1 if power is INVERSE else power or 0
+    return [in_millimetres(n, exponent, millimetres) if k == 2 else n for k, n in enumerate(numbers)]
 
 
 def _source(numbers: list[float], before: int) -> int | None:
@@ -242,8 +244,8 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
     for keyword, row in THICKNESS_SOLVES.items():
         if record := typed.block.last(keyword):
             numbers = _scaled(_solve_numbers(record, 0)[row.from_surface :], row, millimetres)
-            source = record.integer(0, "surface") if row.from_surface else 0
-            yield typed.solve("thickness", row.kind, numbers, source=source)
+            first = record.integer(0, "surface") if row.from_surface else 0
+            yield typed.solve("thickness", row.kind, numbers, source=first)
     if record := typed.block.last("PZUP"):
         source = _source([record.number(0, "surface")], typed.number)
         scale, offset = record.number(1, "factor", 1.0), measured(record, 2, "offset", millimetres, 0.0)
@@ -264,18 +266,18 @@ def _thickness_rules(typed: TypedSurface) -> Iterator[Vary | Solve]:
 def _parameter_pickup(typed: TypedSurface, j: int, record: Record, surfaces: Sequence[TypedSurface]) -> Iterator[Solve]:
     numbers = _solve_numbers(record, 1)
     source = _source(numbers, typed.number)
-    names, names_there = typed.names("PARM", j), {} if source is None else surfaces[source].names("PARM", j)
-    name, there = next(iter(names), ""), next(iter(names_there), "")
+    names, names_of_source = typed.names("PARM", j), {} if source is None else surfaces[source].names("PARM", j)
+    name, other = next(iter(names), ""), next(iter(names_of_source), "")
     power = typed.row.power("PARM", j)
-    is_linear = name and there and names[name] == names_there[there] == 1
+    is_linear = bool(name and other) and names[name] == names_of_source[other] == 1
     if power is INVERSE:  # the lens holds the reciprocals of lengths, which are proportional without an offset
-        is_linear = is_linear and len(numbers) > 1 and numbers[1] and not any(numbers[2:])
-    if not is_linear or any(numbers[3:]) or len(numbers) < 2:
+        is_linear = is_linear and len(numbers) > 1 and numbers[1] != 0 and not any(numbers[2:])
+    if source is None or not is_linear or any(numbers[3:]) or len(numbers) < 2:
         yield typed.solve(f"PARM {j}", "PPAR", _with_offset(numbers, power or 0, typed.millimetres))
         return
     offset = in_millimetres(numbers[2] if len(numbers) > 2 else 0.0, power or 0, typed.millimetres)
     scale = inverse(record.words[2], 1.0) if power is INVERSE else numbers[1]
-    yield typed.pickup(name, source, scale, offset, there if there != name else "")
+    yield typed.pickup(name, source, scale, offset, other if other != name else "")
     yield from _followers(typed, names)
 
 
@@ -322,8 +324,9 @@ def read(
     rules: of the surfaces; configured: the variables and pickups of the numbers that operands set.
     """
     millimetres, head = surfaces[0].millimetres, sections.system.last("MNUM")
-    start = head.place.line if head and head.place.line > sections.surfaces[-1].place.line else math.inf
-    tail = [record for record in sections.tail if record.place.line < start]
+    start = head.place.line or 0 if head else 0
+    behind = start > (sections.surfaces[-1].place.line or 0)  # MNUM follows the surfaces
+    tail = [record for record in sections.tail if not behind or (record.place.line or 0) < start]
     set_by_operands = {operand.paths[0].path for operand in lens.operands if operand.paths}
 
     def is_overridden(rule: Vary | Solve) -> bool:
@@ -402,19 +405,18 @@ def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data:
 
 
 def _distributions(lines: Sequence[Record]) -> Iterator[tuple[str, tuple[tuple[float, float], ...]]]:
-    """The tables of errors (x, density) in files beside that of the lens, which comments of STAT 3 name."""
+    """The tables of errors (x, density) in the folder of the lens file, by the names in comments of STAT 3."""
     for line, comment in itertools.pairwise(lines):
         name = comment.text.strip()
         path = Path(line.place.file).parent / name
         if line.words[:2] == ("STAT", "3") and comment.keyword == "TCMM" and name == path.name and path.is_file():
             try:
-                points = [tuple(map(float, row.split()[:2])) for row in read_text(path).splitlines() if row.strip()]
-            except ValueError:
-                points = [()]
-            if not all(len(point) == 2 for point in points):
+                pairs = [row.split()[:2] for row in read_text(path).splitlines() if row.strip()]
+                points = tuple((float(fraction), float(density)) for fraction, density in pairs)
+            except ValueError as error:
                 message = f"{name}: expected two numbers a line, the fraction of the limits and the density there"
-                raise LensFileError(f"STAT: {message}", line.place)
-            yield name, tuple(points)
+                raise LensFileError(f"STAT: {message}", line.place) from error
+            yield name, points
 
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------
@@ -430,7 +432,8 @@ def merit_rows(lines: Iterable[Record], report: Draft, *, before_target: int = 0
     before_target: count of numbers that precede the target, unlike in a .zmx file. Raises LensFileError for a malformed
     number of a known operand.
     """
-    rows, unknown = [], {}
+    rows: list[Row] = []
+    unknown: dict[str, Place] = {}
     for record in lines:
         word = record.keyword
         if word in TOLERANCES:
@@ -438,16 +441,16 @@ def merit_rows(lines: Iterable[Record], report: Draft, *, before_target: int = 0
         if word == _TEXT:
             rows.append(Row(word, text=record.text.strip()))
         elif word in DIMENSION or (word not in SYSTEM_IGNORED and _is_row(record)):
-            integers = tuple(record.integer(k, "whole number", 0) for k in (0, 1))
-            numbers = tuple(record.number(k, "argument", 0.0) for k in range(2, 6))
+            integers = record.integer(0, "whole number", 0), record.integer(1, "whole number", 0)
+            h_x, h_y, p_x, p_y = (record.number(k, "argument", 0.0) for k in range(2, 6))
             target, weight = (
                 record.number(6 + before_target + k, name, 0.0) for k, name in enumerate(("target", "weight"))
             )
             behind = record.words[8 + before_target :]
             text = next((k for k, w in enumerate(behind) if not is_number(w)), len(behind))
-            further = (*record.words[6 : 6 + before_target], *behind[:text])
-            further = tuple(plain(w) for w in further if is_number(w))
-            rows.append(Row(word, integers, numbers, target, weight, " ".join(behind[text:]), further))
+            others = (*record.words[6 : 6 + before_target], *behind[:text])
+            further = tuple(plain(w) for w in others if is_number(w))
+            rows.append(Row(word, integers, (h_x, h_y, p_x, p_y), target, weight, " ".join(behind[text:]), further))
             if word not in DIMENSION:
                 unknown.setdefault(word, record.place)
         else:
@@ -522,7 +525,7 @@ def margin_line(data: OptimizationData | None) -> str:
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     """The lines of a surface with its variables, solves and pickups. Raises LensFileError for a rule without a line."""
     data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
-    rules = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
+    rules = [rule for rule in data.rules if rule.surface == number]
     pickups = _operand_pickups(lens, number, place)
     solved = {rule.quantity for rule in rules if isinstance(rule, Solve) and rule.operand is None}
     picked = {rule.quantity for rule in pickups}
@@ -531,15 +534,16 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     ]
     rules += [rule for rule in pickups if rule.quantity not in solved]
     if lens.optimization_data is not None:
-        sizes = [rule for rule in rules if rule.quantity == "semi_diameter"]
+        sizes = [rule for rule in rules if rule.quantity == "semi_diameter" and isinstance(rule, Solve)]
         code, source = (_FIXED if number in data.semi_diameters else 0), 0
         if not code and sizes:
             code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
         lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
     rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
     row, surface = types().get(type_of(lens.surfaces[number]) or ""), lens.surfaces[number]
-    has_numbers = bool(rules) and row is not None
-    parameters = row.named(surface, row.numbers(surface)._replace(size=surface.semi_diameter)) if has_numbers else {}
+    parameters: dict[str, tuple[str, int, Surface]] = {}
+    if rules and row is not None:
+        parameters = row.named(surface, row.numbers(surface)._replace(size=surface.semi_diameter))
     for rule in rules:
         if isinstance(rule, Solve) and rule.kind == "pickup" and rule.source == number and rule.quantity != "glass":
             continue  # a further number of the lens that the same number of the file gives
@@ -553,7 +557,7 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
             lines = _behind(lines, "CONI", "VCON")
         elif isinstance(rule, Vary) and rule.quantity in _GLASS_NUMBERS.values():
             lines = changed(lines, "GLAS", {1 + k: "1" for k, name in _GLASS_NUMBERS.items() if name == rule.quantity})
-        elif rule.quantity == "glass":
+        elif rule.quantity == "glass" and isinstance(rule, Solve):
             words = {2: str(_code_of(rule.kind, _GLASS_RULES))}
             if rule.kind == "pickup":
                 lines, words[3] = with_glass_line(lines), str(rule.source)
@@ -574,7 +578,7 @@ def _operand_pickups(lens: Lens, number: int, place: Place) -> list[Solve]:
         if number == operand.number or not followed or followed[0].path[2] == "environment":
             continue
         path, scale, offset = followed[0]
-        names = {at.steps: name for name, at in parameter_paths(lens.surfaces[number]).items()}
+        names = {held.steps: name for name, held in parameter_paths(lens.surfaces[number]).items()}
         is_parameter = operand.name in ("PRAM", *(f"PAR{j}" for j in range(1, 9)))
         quantity = names.get(path[2:]) if is_parameter else quantities.get(operand.name)
         if not quantity or path[2:] != operand.paths[0].path[2:]:
@@ -602,9 +606,9 @@ def changed(lines: Lines, keyword: str, words: dict[int, str]) -> Lines:
 
 
 def _behind(lines: Lines, start: str, line: str) -> Lines:
-    """The lines with one inserted behind the one of that start, or at the end."""
-    at = next((k for k, other in enumerate(lines, 1) if f"{other} ".startswith(f"  {start} ")), len(lines))
-    return [*lines[:at], f"  {line}", *lines[at:]]
+    """The lines with another inserted behind the line that begins with `start`, or at the end."""
+    count = next((k for k, other in enumerate(lines, 1) if f"{other} ".startswith(f"  {start} ")), len(lines))
+    return [*lines[:count], f"  {line}", *lines[count:]]
 
 
 def _thickness_line(rule: Vary | Solve, place: Place) -> str:
@@ -645,21 +649,27 @@ def with_glass_line(lines: Lines) -> Lines:
     return _behind(lines, "DISZ", f"GLAS {BLANK} 0 0 1.5 40 0 0 0 0 0 0")
 
 
-def _with_parameter(lines: Lines, rule: Vary | Solve, row: SurfaceType, parameters: dict, place: Place) -> Lines:
-    keyword, _, j = rule.quantity.partition(" ")
-    keyword, j = (keyword, int(j)) if keyword in ("PARM", "XDAT") and j else parameters.get(rule.quantity, ("", 0))[:2]
-    if not keyword:
+def _with_parameter(
+    lines: Lines, rule: Vary | Solve, row: SurfaceType | None, parameters: Mapping[str, tuple], place: Place
+) -> Lines:
+    keyword, _, digits = rule.quantity.partition(" ")
+    if keyword in ("PARM", "XDAT") and digits:
+        j = int(digits)
+    elif rule.quantity in parameters:
+        keyword, j, _ = parameters[rule.quantity]
+    else:
         raise _unheld(rule, place)
     is_variable = isinstance(rule, Vary) or rule.kind == "variable"
     if keyword == "XDAT":
         further = [] if isinstance(rule, Vary) else [*map(_spelled, rule.numbers)]
-        words = {3: str(VARIABLE if is_variable else _code_of(rule.kind, {}))} | dict(enumerate(further, 4))
+        code = VARIABLE if isinstance(rule, Vary) or is_variable else _code_of(rule.kind, {})
+        words = {3: str(code)} | dict(enumerate(further, 4))
         start = f"  XDAT {j} "
         return [changed([line], "XDAT", words)[0] if line.startswith(start) else line for line in lines]
-    if is_variable:
+    if isinstance(rule, Vary) or is_variable:
         line = f"VPAR {j}"
     elif rule.kind == "pickup":
-        scale = spelled_inverse(rule.scale) if row.parameters[j].power is INVERSE else repr(rule.scale)
+        scale = spelled_inverse(rule.scale) if row and row.power("PARM", j) is INVERSE else repr(rule.scale)
         line = f"PPAR {j} {rule.source} {scale} {rule.offset!r} 0"
     else:
         line = " ".join([f"PPAR {j}", *map(_spelled, rule.numbers)])
@@ -684,16 +694,18 @@ def statuses(lens: Lens, written: Sequence[Operand]) -> dict[tuple[int, int], tu
     if lens.optimization_data is None:
         return {}
     positions = {id(operand): k for k, operand in enumerate(written)}
-    at = [positions.get(id(operand)) for operand in lens.operands]
-    words = {}
-    for rule in (*lens.optimization_data.variables, *lens.optimization_data.solves, *lens.optimization_data.kept):
-        if rule.operand is None or rule.operand >= len(at) or at[rule.operand] is None:
+    written_at = [positions.get(id(operand)) for operand in lens.operands]
+    words: dict[tuple[int, int], tuple[str, str]] = {}
+    for rule in lens.optimization_data.rules:
+        if rule.operand is None or rule.operand >= len(written_at):
+            continue
+        if (position := written_at[rule.operand]) is None:
             continue
         if isinstance(rule, Vary) or rule.kind == "variable":
             status = str(VARIABLE), "0 1 1 1.0 0.0 0"
         else:
-            row = at[int(rule.numbers[0])] if rule.numbers else None
+            row = written_at[int(rule.numbers[0])] if rule.numbers else None
             pickup = f"0 {rule.source} {0 if row is None else row + 1} {rule.scale!r} {rule.offset!r} 0"
             status = str(_code_of(rule.kind, STATUSES)), pickup
-        words[at[rule.operand], rule.configuration] = status
+        words[position, rule.configuration] = status
     return words

@@ -84,7 +84,7 @@ def read(
         ),
     ):
         if parts.system.integer(keyword, quantity, 0, position):
-            report.warn(message, parts.system.last(keyword).place)
+            report.warn(message, parts.system.place_of(keyword))
     of_name = partial(medium, catalogs=came, user=catalogs, report=report.again())
     typed = optimization.typed_surfaces(parts, lens, unit)
     rules = optimization.rules_of(typed, report)
@@ -97,19 +97,20 @@ def read(
 
 def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Draft, file: str) -> Lens:
     """The lens of these surfaces and the records of the system."""
-    system, stop = parts.system, _stop(parts.surfaces)
+    system, marked = parts.system, _stop(parts.surfaces)
+    stop = marked.place.surface or 0
     name, environment = system.last("NAME"), configurations.environment(system)
     aiming, primary = system.last("RAIM"), system.last("PWAV")
     kind = system.integer("RAIM", "ray aiming", 0, 1)
     if not 0 <= kind < len(AIMINGS):
-        raise LensFileError(f"RAIM of kind {kind}, expected 0 (off), 1 (paraxial) or 2 (real)", aiming.place)
+        raise LensFileError(f"RAIM of kind {kind}, expected 0 (off), 1 (paraxial) or 2 (real)", system.place_of("RAIM"))
     wavelengths = _wavelengths(system, report)
     if primary is None and len(wavelengths["wavelengths"]) > 1:
         report.warn("no PWAV: the first wavelength is taken as the primary one", system.place)
-    aperture_kind, aperture, source = _aperture(system, surfaces[stop.place.surface].semi_diameter, unit, report)
+    aperture_kind, aperture, source = _aperture(system, surfaces[stop].semi_diameter, unit, report)
     draft = LensDraft(
         surfaces=surfaces,
-        stop=stop.place.surface,
+        stop=stop,
         aperture_kind=aperture_kind,
         aperture=aperture,
         **_fields(system, unit, report),
@@ -123,7 +124,7 @@ def _lens(parts: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
         environment=environment,
     )
     draft.sources |= {
-        "stop": ("STOP", stop.place),
+        "stop": ("STOP", marked.place),
         "aperture": (f"{source.keyword} is {shown(' '.join(source.words[:1]))}", source.place),
     }
     if primary:
@@ -197,11 +198,12 @@ def _count(system: Block, position: int, quantity: str) -> int | None:
 
 def _fields(system: Block, unit: float, report: Draft) -> dict:
     """The field points: FTYP (kind, telecentric, count), XFLN, YFLN, weights and vignetting factors."""
-    record = system.last("FTYP")
     kind = system.integer("FTYP", "kind of field", 0)
     if not 0 <= kind < len(FIELD_KINDS):
         name = f" ({FIELD_NAMES[kind]})" if kind in FIELD_NAMES else ""
-        raise LensFileError(f"FTYP {kind}{name} is not modelled; expected a kind of field from 0 to 3", record.place)
+        raise LensFileError(
+            f"FTYP {kind}{name} is not modelled; expected a kind of field from 0 to 3", system.place_of("FTYP")
+        )
     count = _count(system, 2, "number of fields")
     if count is None:
         count = 1
@@ -210,7 +212,7 @@ def _fields(system: Block, unit: float, report: Draft) -> dict:
             while len(line.words) >= 12 and len(words) > 1 and words[-1].strip("+-0.eE") == "":
                 words.pop()
             count = max(count, len(words))
-        place = record.place if record else system.place
+        place = system.place_of("FTYP")
         report.warn(f"the number of fields is not stated (FTYP, third value); {count} taken", place)
     lists = {name: _list(system, name, count, report) for name in sorted(FIELD_LISTS, key=str.islower)}
     length = 1.0 if kind == 0 else unit
@@ -260,7 +262,7 @@ def _wavelengths(system: Block, report: Draft) -> dict:
         weight = [weights.number(k, "weight", 1.0) if weights else 1.0 for k in range(count)]
         pairs = [(listed.number(k, "wavelength"), weight[k], listed) for k in range(count)]
     else:
-        place = (slots or {0: system}).popitem()[1].place
+        place = system.place_of("WAVM")
         message = f"WAVM {', '.join(map(str, sorted(slots)[:6]))}" if slots else "no WAVM"
         raise LensFileError(f"{message}, expected {count} wavelengths (WAVM 1 to {count})", place)
     wrong = next((record for wave, weight, record in pairs if not wave > 0 or weight < 0), pairs[0][2])
@@ -274,7 +276,8 @@ def _wavelengths(system: Block, report: Draft) -> dict:
 
 def _notes(system: Block) -> tuple[str, ...]:
     """The notes: NOTE 0 holds text in lines of 200 characters, any other number ends a note."""
-    notes, continues = [], False
+    notes: list[str] = []
+    continues = False
     for record in system.all("NOTE"):
         kind, _, text = record.text.partition(" ")
         if kind != "0":

@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from decimal import Context, Decimal
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -44,6 +44,7 @@ from raytrace.io.source import (
 )
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
+from raytrace.maths.numerics import Number
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Path as LensPath
 from raytrace.system.configurations import part, same
@@ -107,8 +108,8 @@ SURFACE_IGNORED = by_word(
 )
 TAIL_REASON = "behind the surfaces, and no line of a merit function, of tolerances or of configurations"
 
-#: Types of surface that are not modelled, by OpticStudio's names; those that are, are rows of `surfaces.TYPES`.
-_TYPES = (
+#: Types of surface that are not modelled, by OpticStudio's names; modelled types are rows of `types`.
+_OTHER_TYPES = (
     "EGRATING elliptical grating, XOSPHERE extended odd asphere, ZERNSAG Zernike sag, "
     "SZERNSAG Zernike standard sag, SZERNPHA Zernike standard phase, POLYNOMI polynomial, BINARY_3 binary 3, "
     "BINARY_4 binary 4, QED_TYPE Q-type asphere, CFRESNEL cylindrical Fresnel, GRINSUR1 gradient index 1, "
@@ -118,7 +119,7 @@ _TYPES = (
     "BIREFR_I birefringent in, BIREFR_O birefringent out, BICONIC biconic, CUBICSPL cubic spline, DATASURF data, "
     "BLACKBOX black box"
 )
-TYPE_NAMES = dict(name.split(" ", 1) for name in _TYPES.split(", "))
+TYPE_NAMES = dict(name.split(" ", 1) for name in _OTHER_TYPES.split(", "))
 
 #: System apertures: keyword, and the number after the size if it has one.
 SYSTEM_APERTURES = {
@@ -153,7 +154,7 @@ FIELD_LISTS = {
     },
 }
 
-#: The lists hold so many fields; an FEFD line holds a number of every list for each further field.
+#: Number of fields in the lists; an FEFD line holds a number of every list for each further field.
 FIELDS_IN_LISTS = 12
 
 #: Ray aiming by the second number of RAIM; a file without RAIM specifies none.
@@ -184,7 +185,7 @@ def glass_source(block: Block) -> int | None:
     if not record or len(record.words) < 3 or record.words[1] != "2" or not re.fullmatch("[0-9]{1,6}", record.words[2]):
         return None
     source = int(record.words[2])
-    return source if source < block.place.surface else None
+    return source if source < block.surface else None
 
 
 #: Lines of tolerances: an operand, and the comment on it.
@@ -220,7 +221,9 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     if start is None:
         hint = "is it a sequential lens file of OpticStudio (.zmx)?"
         raise LensFileError(f"no SURF line in {len(lines)} lines; {hint}", Place(file))
-    system, surfaces, tail = Block(Place(file)), [], []
+    system = Block(Place(file))
+    surfaces: list[Block] = []
+    tail: list[Record] = []
     indents = any(record.indented for record in lines[start:])
     block, after_surfaces = system, False
     for record in lines:
@@ -311,14 +314,14 @@ NUMBER, SIZE, WHOLE, SWITCH, AIMING, TEXT, GLASS = "number", "size", "whole", "s
 class ValueRow(NamedTuple):
     """A value of a record: reader, writer, unit conversion and the multi-configuration operand follow from its row.
 
-    of: the argument of the operand: "surface", "field", "wavelength", or "" of the system.
+    argument: of the operand: "surface", "field", "wavelength", or "" of the system.
     keyword, word: the record, and the position of the value in it, from 1; 0: that of the field.
     path: of the value in its surface, or in the lens; "" where the type of the surface decides (PARM, XDAT).
     power: of length in the value; of fields, of those that are lengths. quantity: as an error calls it.
     refracts: whether the paraxial rays at other surfaces depend on it, and with them the solves there.
     """
 
-    of: str
+    argument: str
     keyword: str
     word: int
     path: str
@@ -330,9 +333,9 @@ class ValueRow(NamedTuple):
     def path_in_lens(self, number: int) -> LensPath:
         """The path of the value of a surface, field or wavelength of this number, in a lens."""
         *steps, last = (int(step) if step.isdigit() else step for step in self.path.split("."))
-        if self.of in ("field", "wavelength"):
+        if self.argument in ("field", "wavelength"):
             return (*steps, (last, number - 1)) if isinstance(last, int) else (*steps, last, (number - 1,))
-        return (*(("surfaces", number) if self.of == "surface" else ()), *steps, last)
+        return (*(("surfaces", number) if self.argument == "surface" else ()), *steps, last)
 
     def read(self, record: Record, millimetres: float = 1.0, default: float | None = None) -> float:
         """The number of a record, in powers of mm."""
@@ -400,7 +403,7 @@ def _powers() -> dict[str, dict[int, int]]:
     """The powers of length of the rows, and those of words without an operand."""
     powers: dict[str, dict[int, int]] = {"SDMA": {3: 1}, "VDSZ": {1: 1, 2: 1}, "PZUP": {3: 1}, "UDAD": {2: 1, 3: 1}}
     for row in ROWS.values():
-        if row.power and row.of != "field":
+        if row.power and row.argument != "field":
             powers.setdefault(row.keyword, {})[row.word] = row.power
     return powers
 
@@ -412,7 +415,7 @@ POWERS = _powers()
 def measured(record: Record, position: int, quantity: str, millimetres: float, default: float | None = None) -> float:
     """The number of a record at a position, in powers of mm."""
     shape, _ = aperture_keywords().get(record.keyword, ("", False))
-    is_size = bool(shape) and position < SHAPES[shape].sizes
+    is_size = bool(shape) and position < (SHAPES[shape].sizes or 0)
     power = 1 if is_size else POWERS.get(record.keyword, {}).get(position + 1, 0)
     return in_millimetres(record.number(position, quantity, default), power, millimetres)
 
@@ -426,12 +429,17 @@ class Numbers(NamedTuple):
     size: the surface's semi-diameter.
     """
 
-    parameters: Mapping[int, float | Tensor]
+    parameters: Mapping[int, Number]
     terms: Tensor | None = None
-    radius: float | Tensor = 1.0
+    radius: Number = 1.0
     size: float | None = None
 
-    def at(self, j: int) -> float:
+    @property
+    def has_terms(self) -> bool:
+        """Whether one of the terms is not 0."""
+        return self.terms is not None and bool(self.terms.any())
+
+    def at(self, j: int) -> Number:
         """PARM j, 0 if it is absent."""
         return self.parameters.get(j, 0.0)
 
@@ -514,7 +522,7 @@ class SurfaceType:
         )
 
     def _coefficients(self, coefficients: list[float], numbers: Numbers) -> dict:
-        if self.terms_are_coefficients:  # a_i = α_i / R^2i
+        if self.terms_are_coefficients and numbers.terms is not None:  # a_i = α_i / R^2i
             coefficients = [α / numbers.radius ** (2 * i) for i, α in enumerate(numbers.terms.tolist(), 1)]
         if self.least is None:
             count = max(numbers.parameters, default=len(coefficients))
@@ -531,13 +539,14 @@ class SurfaceType:
         values = {name: number if isinstance(number, int) else double(number) for name, number in values.items()}
         if self.terms is not None:
             values |= {"coefficients": numbers.terms if has_terms else double([0.0]), "radius": double(numbers.radius)}
-        if self.part is IrregularSag:
+        if self.part is IrregularSag and numbers.size is not None:
             values["radius"] = double(numbers.size)
         return {"phase" if "phase" in self.holds else "sag_terms": self.part(**values)}
 
     def numbers(self, surface: Surface) -> Numbers:
         """`fields` inverted. Raises ValueError for numbers that the type cannot hold."""
-        sag, pose, parameters = surface.sag_terms, surface.before, {}
+        sag, pose = surface.sag_terms, surface.pose
+        parameters: dict[int, Number] = {}
         if self.is_break and pose is not None and pose.z is not None:
             raise ValueError("a decentre along z; add it to the thickness before")
         if isinstance(sag, IrregularSag):
@@ -547,7 +556,7 @@ class SurfaceType:
             pose = pose if poses_are_parameters(surface) else None
         for j, parameter in self.parameters.items():
             owner, *name = parameter.place.path
-            value = pose if owner == "before" else getattr(surface, owner)
+            value: Any = pose if owner == "before" else getattr(surface, owner)
             for step in name:
                 value = 0.0 if value is None else getattr(value, step)
             value = 0.0 if value is None and owner == "before" else value
@@ -558,7 +567,7 @@ class SurfaceType:
             parameters[j] = float(value) if parameter.is_integer else value
         if self.terms is None or not (self.part or self.terms_are_coefficients):
             return Numbers(parameters)
-        held = surface if self.part is None else surface.phase or sag
+        held: Any = surface if self.part is None else surface.phase or sag
         return Numbers(parameters, held.coefficients, 1.0 if self.part is None else held.radius)
 
     def places(
@@ -652,9 +661,8 @@ def _no_focal_length(numbers: Numbers) -> str:
 
 
 def _no_order(numbers: Numbers) -> str:
-    return (
-        "no order of diffraction (PARM 0); lines lost?" if 0 not in numbers.parameters and numbers.terms.any() else ""
-    )
+    is_missing = 0 not in numbers.parameters and numbers.has_terms
+    return "no order of diffraction (PARM 0); lines lost?" if is_missing else ""
 
 
 def _no_construction(numbers: Numbers) -> str:
@@ -698,7 +706,7 @@ _TYPES = {
         least=1,
         terms=1,
         most=240,
-        beyond=lambda numbers: "with Zernike terms (XDAT 1)" if bool(numbers.terms.any()) else "",
+        beyond=lambda numbers: "with Zernike terms (XDAT 1)" if numbers.has_terms else "",
     ),
     "BICONICX": SurfaceType("biconic", _ROUND, _coefficients(1, [INVERSE, 0]), kind="biconic", least=2),
     "XPOLYNOM": SurfaceType(
@@ -793,10 +801,10 @@ def type_of(surface: Surface) -> str | None:
     """The TYPE that a surface is written as; None where a .zmx file has none."""
     if surface.is_break:
         return "COORDBRK"
-    if surface.phase is not None:
-        phase = surface.phase
-        ideal = isinstance(phase, IdealLens) and phase.power_x.dim() == 0
-        return "PARAXIAL" if ideal and float(phase.power_x) == float(phase.power_y) != 0 else _OF_PARTS.get(type(phase))
+    if (phase := surface.phase) is not None:
+        if isinstance(phase, IdealLens) and phase.power_x.dim() == 0:
+            return "PARAXIAL" if float(phase.power_x) == float(phase.power_y) != 0 else "PARAX_XY"
+        return _OF_PARTS.get(type(phase))
     if surface.sag_terms is not None:
         return _OF_PARTS.get(type(surface.sag_terms))
     if surface.coefficients is None:
@@ -810,7 +818,7 @@ def type_of(surface: Surface) -> str | None:
 
 def poses_are_parameters(surface: Surface) -> bool:
     """Whether an irregular surface has a pose that its parameters hold, and that is undone behind the surface."""
-    before, after = surface.before, surface.after
+    before, after = surface.pose, surface.after
     if not isinstance(surface.sag_terms, IrregularSag) or before is None or after is None:
         return False
     return not before.tilts_first and before.z is None and before.tilt_z is None and same(undone(before), after)
@@ -819,7 +827,7 @@ def poses_are_parameters(surface: Surface) -> bool:
 _POSE = tuple(_poses("B", "before").values())
 
 
-def poses(block: Block, millimetres: float) -> dict[str, Pose]:
+def poses(block: Block, millimetres: float) -> dict[str, Pose | None]:
     """The fields "before" and "after" of SCBD records, where they are not 0.
 
     SCBD w o p dx dy tx ty tz: w 1 before, 2 after the surface; o the order, as of a coordinate break; p the method that
@@ -909,9 +917,9 @@ def _report_unused(block: Block, kind: str, row: SurfaceType, report: Draft) -> 
         elif row.terms is not None and j >= end and j > 2 and record.number(1, "value"):
             report.warn(f"XDAT {j}: XDAT 1 states {end - FIRST_TERM} terms, to XDAT {end - 1}; left out", record.place)
     for keyword, name in (("CURV", "curvature"), ("CONI", "conic")):
-        record = block.last(keyword)
-        if record and name not in row.holds and record.number(0, name):
-            report.note(f"{record.place}: {keyword} is not used by a {kind} surface")
+        stored = block.last(keyword)
+        if stored and name not in row.holds and stored.number(0, name):
+            report.note(f"{stored.place}: {keyword} is not used by a {kind} surface")
     for record in block.all("SCBD"):
         if record.words[:1] == ("3",) and record.integer(1, "kind of coordinate return", 0) > 0:
             report.note(f"{record.place}: coordinate return; its solved values, which the file stores, are read")
@@ -1007,8 +1015,9 @@ def build(
         distance = float("inf")
     else:
         distance = ROWS["THIC"].read(thickness, millimetres)
-    kind, fields = type_name(block), {}
+    kind = type_name(block)
     row = types()[kind]
+    fields: dict[str, Any] = {}
     if "curvature" in row.holds:
         fields |= {field: _nonzero(block, held, millimetres) for field, held in _SHAPES.items()}
     if row.is_break:
@@ -1052,7 +1061,7 @@ def semi_diameter(block: Block, millimetres: float) -> float | None:
     """DIAM, which is a semi-diameter, in mm; None if absent or 0 (left to be computed)."""
     record = block.last("DIAM")
     size = ROWS["SDIA"].read(record, millimetres) if record and record.words else 0.0
-    if size < 0:
+    if record and size < 0:
         raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
     return size or None
 
@@ -1064,7 +1073,7 @@ def _picked_up(block: Block, blocks: Sequence[Block], report: Draft) -> Record |
     are obsolete.
     """
     record, source = block.last("GLAS"), glass_source(block)
-    if source is None:
+    if record is None or source is None:
         return record
     held = _picked_up(blocks[source], blocks, report)
     name = record.words[0].upper()
@@ -1093,7 +1102,7 @@ def medium(record: Record, catalogs: Sequence[str | Catalog], user: Sequence[Pat
     """
     if not record.words:
         raise LensFileError("GLAS without a name; delete the line for air", record.place)
-    name, surface = record.words[0], record.place.surface
+    name = record.words[0]
     if name.upper() in ("AIR", "MIRROR"):
         return AIR if name.upper() == "AIR" else MIRROR
     if is_blank(record) or record.integer(1, "flag", 0) == 1:
@@ -1102,10 +1111,10 @@ def medium(record: Record, catalogs: Sequence[str | Catalog], user: Sequence[Pat
         dpgf = record.number(5, "ΔPgF", 0.0)
         if nd <= 0 or vd < 0:
             raise LensFileError(f"model glass of nd {nd:g}, Vd {vd:g}; expected nd > 0 and Vd ≥ 0", record.place)
-        report.glass(surface, name, f"model glass nd {nd!r}, Vd {vd!r}, ΔPgF {dpgf!r}")
+        report.glass(record.place, name, f"model glass nd {nd!r}, Vd {vd!r}, ΔPgF {dpgf!r}")
         return by_figures(nd, vd, dpgf, name)
     if is_code(name):
-        report.glass(surface, name, "six-digit code: nd and Vd by its digits")
+        report.glass(record.place, name, "six-digit code: nd and Vd by its digits")
         return mil_glass(name)
     nd, vd = (record.number(k, "index or Abbe number of the glass", 0.0) for k in (3, 4))
     figures = (nd, vd) if nd > 1 and vd > 0 and (nd, vd) != (1.5, 40.0) else None  # 1.5 and 40 are placeholders
@@ -1136,8 +1145,8 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
         sizes = tuple(measured(record, k, "size of the aperture", millimetres) for k in range(count))
     if record.keyword == "FLAP":
         sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
-    at = block.last("OBDC")
-    centre = tuple(ROWS[name].read(at, millimetres) for name in ("APDX", "APDY")) if at else (0.0, 0.0)
+    decentre = block.last("OBDC")
+    centre = tuple(ROWS[name].read(decentre, millimetres) for name in ("APDX", "APDY")) if decentre else (0.0, 0.0)
     return (clear_aperture(shape, sizes, obscures, centre, record.keyword, record.place),)
 
 

@@ -32,7 +32,7 @@ Every other operand is listed with the reason why it is not read.
 import math
 from collections.abc import Sequence
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from raytrace.io.source import LensFileError, Place, Record
 from raytrace.io.zemax.surfaces import in_millimetres, type_of, types
@@ -112,10 +112,10 @@ def _source(record: Record) -> str:
 class _Reader:
     """The rows while lines are read; drawn: the distribution of the last STAT; pivot: the code of the last MPVT."""
 
-    def __init__(self, lens: Lens):
+    def __init__(self, lens: Lens) -> None:
         self.lens, self.data = lens, lens.optimization_data
         self.unit = 1.0 if self.data is None else self.data.unit
-        self.drawn: dict[str, object] = {"distribution": "normal", "sigmas": _SIGMAS}
+        self.drawn: dict[str, Any] = {"distribution": "normal", "sigmas": _SIGMAS}
         self.wavelength, self.pivot = TEST_WAVELENGTH, 0
         self.rows: list[Tolerance] = []
         self.compensators: list[Compensator] = []
@@ -158,7 +158,7 @@ class _Reader:
     def _leave(self, record: Record, reason: str) -> None:
         self.unread.append(f"{record.place}: {record.keyword}: {reason}")
 
-    def _add(self, record: Record, kind: str, surfaces: tuple[int, ...], low: float, high: float, **more) -> None:
+    def _add(self, record: Record, kind: str, surfaces: tuple[int, ...], low: float, high: float, **more: Any) -> None:
         if low > high:
             raise LensFileError(f"{record.keyword}: minimum {low:g} above maximum {high:g}", record.place)
         self.rows.append(Tolerance(kind, surfaces, low, high, **({**self.drawn, "source": _source(record)} | more)))
@@ -180,7 +180,7 @@ class _Reader:
             raise LensFileError(f"{record.keyword}: {quantity} is {number:g}, expected more than 0", record.place)
         return number
 
-    def _motion(self, record: Record, operand: str, part: float = 1.0, **more) -> None:
+    def _motion(self, record: Record, operand: str, part: float = 1.0, **more: Any) -> None:
         """A row by the rule of an operand, with a part of the limits."""
         if operand in _ROLLS:
             self._roll(record, *_ROLLS[operand], part, **more)
@@ -195,11 +195,11 @@ class _Reader:
         return first, last
 
     def _depth(self, first: int, k: int) -> float:
-        """How far the vertex of a surface lies behind that of the first, mm."""
+        """The distance of the vertex of a surface behind that of the first, mm."""
         return sum(float(surface.thickness) for surface in self.lens.surfaces[first:k])
 
     def _pivot(self, record: Record, first: int, last: int) -> float:
-        """How far the pivot of the last MPVT lies behind the vertex of the first surface, mm."""
+        """The distance of the pivot of the last MPVT behind the vertex of the first surface, mm."""
         whole = self._depth(first, last)
         if self.pivot in (0, 1, 4):
             return {0: 0.0, 1: whole, 4: 0.5 * whole}[self.pivot]
@@ -207,17 +207,17 @@ class _Reader:
         h = self.lens.surfaces[k].semi_diameter
         if h is None:
             raise LensFileError(f"MPVT: surface {k} has no semi-diameter (DIAM), and no edge", record.place)
-        h = self.lens.wavelengths.new_tensor(h)
-        return vertex + float(sag_at(self.lens.surfaces[k], 0 * h, h))
+        edge = self.lens.wavelengths.new_tensor(h)
+        return vertex + float(sag_at(self.lens.surfaces[k], 0 * edge, edge))
 
-    def _roll(self, record: Record, axis: str, is_angle: bool, part: float, **more) -> None:
+    def _roll(self, record: Record, axis: str, is_angle: bool, part: float, **more: Any) -> None:
         """A roll on a spherical seat is a tilt about its centre of curvature; on a plane it is a decentre."""
         first, last = self._element(record)
         seat = record.integer(4, "seat", 0) or first
         if not first <= seat <= last:
             message = f"{record.keyword}: the seat, surface {seat}, is not one of the element {first} to {last}"
             raise LensFileError(message, record.place)
-        limits = [part * limit for limit in self._limits(record, 0 if is_angle else 1)]
+        low, high = (part * limit for limit in self._limits(record, 0 if is_angle else 1))
         surface, kind = self.lens.surfaces[seat], f"element_tilt_{axis}"
         radius = math.inf if surface.is_plane else float(surface.radius)
         if math.isinf(radius):
@@ -227,20 +227,20 @@ class _Reader:
         else:
             more["pivot"] = self._depth(first, seat) + radius
             if not is_angle:
-                if max(map(abs, limits)) > abs(radius):
+                if max(abs(low), abs(high)) > abs(radius):
                     message = f"{record.keyword}: a decentre beyond the radius {radius:g} mm of surface {seat}"
                     raise LensFileError(message, record.place)
                 kind, sign = ("element_tilt_y", -1) if axis == "x" else ("element_tilt_x", 1)
-                limits = sorted(sign * math.degrees(math.asin(limit / radius)) for limit in limits)
-        self._add(record, kind, (first, last), *limits, **more)
+                low, high = sorted(sign * math.degrees(math.asin(limit / radius)) for limit in (low, high))
+        self._add(record, kind, (first, last), low, high, **more)
 
-    def _row(self, record: Record, kind: str, part: float, **more) -> None:
+    def _row(self, record: Record, kind: str, part: float, **more: Any) -> None:
         low, high = (part * limit for limit in self._limits(record, KINDS[kind].length))
         first = self._surface(record, 0)
-        surfaces = (first,)
+        surfaces: tuple[int, ...] = (first,)
         if KINDS[kind].elements:
-            surfaces = self._element(record)
-            if kind.startswith("element_tilt") and (pivot := self._pivot(record, *surfaces)):
+            surfaces = first, last = self._element(record)
+            if kind.startswith("element_tilt") and (pivot := self._pivot(record, first, last)):
                 more["pivot"] = pivot
         elif kind == "thickness":
             adjuster = self._surface(record, 1, len(self.lens.surfaces) - 2)
@@ -271,20 +271,20 @@ class _Reader:
             self.drawn["density"] = tables[comment]
 
     def _compensator(self, record: Record) -> None:
-        limits = {"minimum": record.number(2, "minimum", 0.0), "maximum": record.number(3, "maximum", 0.0)}
-        limits = {name: number for name, number in limits.items() if number}
+        ends = {"minimum": record.number(2, "minimum", 0.0), "maximum": record.number(3, "maximum", 0.0)}
+        limits: dict[str, Any] = {name: number for name, number in ends.items() if number}
         source = _source(record)
         if record.keyword == "CMCO":
             operand, configuration = self._place_of_operand(record)
             number = self.lens.operands[operand].number
-            one = Compensator(number, configuration=configuration, operand=operand, source=source, **limits)
+            compensator = Compensator(number, configuration=configuration, operand=operand, source=source, **limits)
         elif record.keyword == "CPAR":
             place = self._name(record)
             if place is None:
                 return
             k, name, scale = place
-            scaled = {key: number * scale for key, number in limits.items()}
-            one = Compensator(k, name, source=source, **scaled)
+            limits = {key: number * scale for key, number in limits.items()}
+            compensator = Compensator(k, name, source=source, **limits)
         else:
             k, code = self._surface(record, 0), record.integer(1, "code", 0)
             if code not in _COMPENSATORS:
@@ -292,9 +292,9 @@ class _Reader:
                 return
             name = _COMPENSATORS[code]
             power = {"thickness": 1, "curvature": -1, "conic": 0}[name]
-            scaled = {key: in_millimetres(number, power, self.unit) for key, number in limits.items()}
-            one = Compensator(k, name, source=source, **scaled)
-        self.compensators.append(one)
+            limits = {key: in_millimetres(number, power, self.unit) for key, number in limits.items()}
+            compensator = Compensator(k, name, source=source, **limits)
+        self.compensators.append(compensator)
 
     def _place_of_operand(self, record: Record) -> tuple[int, int]:
         row, configuration = record.integer(0, "row of the operands"), record.integer(1, "configuration")
@@ -314,7 +314,7 @@ class _Reader:
             self._leave(record, f"operand {held} is no number")
             return
         path = held.paths[0].path if held.paths else ()
-        power = {"thickness": 1, "curvature": -1}.get(path[2], 0) if len(path) == 3 else 0
+        power = {"thickness": 1, "curvature": -1}.get(str(path[2]), 0) if len(path) == 3 else 0
         power = 1 if path[-1:] in (("x",), ("y",)) and "before" in path else power
         low, high = self._limits(record, power)
         surfaces = (held.number,) if held.number else ()

@@ -1,15 +1,14 @@
 """Write a lens as a .zmx file of Zemax OpticStudio: system, surfaces, merit function, configurations.
 
-Every number has the digits that bring it back exactly; numbers of other terms than those of a file are converted first
-(`written_form`). Lines are made in mm. A merit function of lengths and pure
-numbers depends on the unit, so a lens with one is written in the unit of its file: a number read from such a file is
-written such that reading it again gives the same number of mm; of other numbers, two of which may lie between
-neighbouring numbers of the file, the nearest one or the next.
+Every number is written with the digits that read back exactly. Surfaces by numbers that a file does not hold are
+converted first (`written_form`). Lines are made in mm. A merit function of lengths and pure numbers depends on the
+unit, so a lens with a merit function is written in the unit of its file. A number that came from such a file reads back
+as the same number of mm; of other numbers, the file holds the nearest number or its neighbour.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Context, Decimal
 from fractions import Fraction
 from functools import partial
@@ -270,8 +269,8 @@ def _glass(glass: Glass, place: Place) -> list[str]:
     elif glass.formula == "model":
         figures = exact_list(glass.coefficients, "model glass", place)
     else:
-        figures = glass.nd_listed or float(nd(glass)), glass.abbe_listed or float(abbe_number(glass))
-        words = " ".join(exact(number, "index or Abbe number", place) for number in figures)  # for a substitute
+        listed = glass.nd_listed or float(nd(glass)), glass.abbe_listed or float(abbe_number(glass))
+        words = " ".join(exact(number, "index or Abbe number", place) for number in listed)  # for a substitute
         return [f"  GLAS {listed_name(glass, place)} 0 0 {words} 0 0 0 0 0 0"]
     flag, name = 1, listed_name(glass, place) if glass.name else BLANK
     if name.upper() in ("AIR", "MIRROR"):
@@ -345,7 +344,7 @@ def _in_unit(lines: Iterable[str], millimetres: float, place: Place) -> list[str
     return converted
 
 
-def _powers_of(words: list[str], row: SurfaceType, angles: bool) -> dict[int, int | None]:
+def _powers_of(words: list[str], row: SurfaceType, angles: bool) -> Mapping[int, int | None]:
     """The power of length of the words of a line that have one; row: the type of its surface."""
     keyword = words[0] if words else ""
     if keyword in ("PARM", "PPAR"):
@@ -448,6 +447,6 @@ def _in_file_unit(text: str, operand: Operand, row: ValueRow, lens: Lens) -> str
     unit, power = 1.0 if lens.optimization_data is None else lens.optimization_data.unit, power_of(row, lens)
     if not row.path:
         parameter = int(operand.name[3]) if operand.name[:3] == "PAR" else operand.parameter
-        power = types()[type_of(lens.surfaces[operand.number])].power(row.keyword, parameter)
+        power = types()[type_of(lens.surfaces[operand.number]) or ""].power(row.keyword, parameter)
         text = spelled_inverse(float(text)) if power is INVERSE else text
     return text if unit == 1 or power == 0 else in_file(text, power, unit)

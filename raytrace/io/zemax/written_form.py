@@ -24,6 +24,7 @@ from raytrace.system.sag_terms import (
     IrregularSag,
     PolynomialSag,
     PowerSag,
+    SagTerms,
     TiltSag,
     ZernikeSag,
     about_vertex,
@@ -69,9 +70,9 @@ def _with_polynomial(surface: Surface, place: Place) -> Surface:
     """A surface whose sag terms are fringe terms or an extended polynomial, where no type holds them otherwise."""
     sag = surface.sag_terms
     on_terms = surface.coefficients is not None and isinstance(sag, PolynomialSag | IrregularSag | TiltSag)
-    if not (isinstance(sag, PowerSag | ZernikeSag) or on_terms):
+    if sag is None or not (isinstance(sag, PowerSag | ZernikeSag) or on_terms):
         return surface
-    _refuse_batch(surface, place)
+    _refuse_batch(sag, place)
     if surface.coefficients is not None and surface.kind != EVEN:
         message = f"errors of the sag of a surface that is {KINDS[surface.kind].name}, expected an even asphere at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
@@ -93,12 +94,11 @@ def _raised(surface: Surface, height: Tensor) -> Surface:
     """A surface shifted along z by a height () mm."""
     if not bool(height):
         return surface
-    before, after = [surface.before, Pose(z=height)], [Pose(z=-height), surface.after]
-    return dataclasses.replace(surface, before=_one(before), after=_one(after))
+    before, after = _joint(surface.pose, Pose(z=height)), _joint(Pose(z=-height), surface.after)
+    return dataclasses.replace(surface, before=before, after=after)
 
 
-def _refuse_batch(surface: Surface, place: Place) -> None:
-    sag = surface.sag_terms
+def _refuse_batch(sag: SagTerms, place: Place) -> None:
     numbers = {field.name: getattr(sag, field.name) for field in dataclasses.fields(sag)}
     for name, number in numbers.items():
         if number.dim() > (name == "coefficients"):
@@ -109,7 +109,8 @@ def _refuse_batch(surface: Surface, place: Place) -> None:
 # -- poses ------------------------------------------------------------------------------------------------------------
 
 
-def _one(poses: list[Pose | None]) -> Pose:
+def _joint(*poses: Pose | None) -> Pose:
+    """The pose of several in sequence."""
     modelled = [pose for pose in poses if pose is not None]
     return modelled[0] if len(modelled) == 1 else pose_of(rows_along(modelled))
 
@@ -118,7 +119,7 @@ def _joined(surface: Surface) -> Surface:
     """A coordinate break with one pose alone."""
     if not surface.is_break or surface.after is None:
         return surface
-    return dataclasses.replace(surface, before=_one([surface.before, surface.after]), after=None)
+    return dataclasses.replace(surface, before=_joint(surface.pose, surface.after), after=None)
 
 
 def _check_poses(surface: Surface, posed: Surface, place: Place) -> None:
@@ -133,21 +134,21 @@ def _check_poses(surface: Surface, posed: Surface, place: Place) -> None:
             raise LensFileError(f"{message}; put the turn on a coordinate break of its own", place)
 
 
-def _rotation(pose: Pose | None):
+def _rotation(pose: Pose | None) -> Tensor:
     rows = rows_along([pose])
     return torch.tensor([[float(entry) for entry in row[:3]] for row in rows], dtype=torch.float64)
 
 
-# -- what follows -----------------------------------------------------------------------------------------------------
+# -- operands of configurations, and rules ----------------------------------------------------------------------------
 
 
 def _followed(operand: Operand, lens: Lens, posed: list[Surface], place: Place) -> Operand:
     """An operand of configurations whose thickness has the step of that of the lens."""
-    steps = []
+    steps: list[Tensor | None] = []
     for scaled in operand.paths:
         step = None
-        if scaled.path[0] == "surfaces":
-            _, k, field, *_ = scaled.path
+        if scaled.path[0] == "surfaces" and isinstance(k := scaled.path[1], int):
+            field = str(scaled.path[2])
             old, new, place = lens.surfaces[k], posed[k], place._replace(surface=k)
             if field == "thickness" and new.thickness is not old.thickness:
                 step = (new.thickness - old.thickness) / scaled.factor
@@ -156,10 +157,11 @@ def _followed(operand: Operand, lens: Lens, posed: list[Surface], place: Place) 
         steps.append(step)
     if all(step is None for step in steps):
         return operand
-    if not all(step is not None and bool(step == steps[0]) for step in steps):
+    first = steps[0]
+    if operand.numbers is None or first is None or not all(step is not None and bool(step == first) for step in steps):
         message = f"{operand}: errors change numbers that follow it, which a .zmx file does not hold in other terms"
         raise LensFileError(f"{message}; write one configuration", place)
-    return dataclasses.replace(operand, numbers=operand.numbers + steps[0])
+    return dataclasses.replace(operand, numbers=operand.numbers + first)
 
 
 def _rules(lens: Lens, changed: Lens) -> OptimizationData | None:
@@ -169,12 +171,16 @@ def _rules(lens: Lens, changed: Lens) -> OptimizationData | None:
         return None
 
     def holds(rule: Vary | Solve) -> bool:
-        old, new = (one.surfaces[rule.surface] for one in (lens, changed))
+        old, new = lens.surfaces[rule.surface], changed.surfaces[rule.surface]
         if rule.operand is not None or old is new:
             return True
         if rule.quantity == "thickness":
             return isinstance(rule, Vary) or new.thickness is old.thickness
         return rule.quantity in _KEPT or all(getattr(old, field) is getattr(new, field) for field in _CHANGED)
 
-    kept = {name: tuple(filter(holds, getattr(data, name))) for name in ("variables", "solves", "kept")}
-    return dataclasses.replace(data, **kept)
+    return dataclasses.replace(
+        data,
+        variables=tuple(filter(holds, data.variables)),
+        solves=tuple(filter(holds, data.solves)),
+        kept=tuple(filter(holds, data.kept)),
+    )

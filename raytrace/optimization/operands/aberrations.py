@@ -20,7 +20,7 @@ from raytrace.analysis.chief import (
     relative_error,
 )
 from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
-from raytrace.maths.numerics import dot_2, value_of
+from raytrace.maths.numerics import Number, dot_2, value_of
 from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.operand import (
     BadRow,
@@ -29,6 +29,7 @@ from raytrace.optimization.operands.operand import (
     Line,
     Operand,
     Planner,
+    RowValue,
     RowValues,
     known,
     per_row,
@@ -53,11 +54,12 @@ def unvignetted(lens: Lens, field: tuple[float, float], pupil: tuple[float, floa
     """The pupil point that vignetting factors take to a point of the whole pupil, by default its centre."""
     if lens.fields.vignetting is None:
         return pupil
-    at = float(lens.fields.extent) * torch.tensor(field, dtype=torch.float64)[:, None]
+    angles = float(lens.fields.extent) * torch.tensor(field, dtype=torch.float64)[:, None]
     corners = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    shift, *ends = vignette(lens, at, corners).numpy().T
+    shift, *ends = vignette(lens, angles, corners).numpy().T
     matrix = np.stack([end - shift for end in ends], -1)
-    return tuple(np.linalg.solve(matrix, np.array(pupil) - shift).tolist())
+    x, y = np.linalg.solve(matrix, np.array(pupil) - shift).tolist()
+    return x, y
 
 
 def _chief(line: Line, planner: Planner, field: tuple[float, float], wavelength: int) -> int:
@@ -71,7 +73,7 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """The axial crossing of one wavelength less that of another, along the light."""
     side = _side(planner) * float(np.sign(planner.view.indices[0][-2]))
 
-    def row(line: Line) -> Callable[[EvaluationContext], object]:
+    def row(line: Line) -> RowValue:
         zone, (first, second) = line.row.numbers[0], _two_wavelengths(line, planner)
         if not zone:
             return lambda context: (
@@ -80,7 +82,7 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
         waves = (first, second)
         rays = np.array([planner.ray(line, field=(0.0, 0.0), pupil=(0.0, zone), wavelength=w) for w in waves])
 
-        def number(context: EvaluationContext):
+        def number(context: EvaluationContext) -> Number:
             hits = context.hits(rays)
             crossing = known(hits.valid, hits.position[2] - hits.position[1] * hits.direction[2] / hits.direction[1])
             return side * (crossing[0] - crossing[1])
@@ -134,14 +136,14 @@ def _side(planner: Planner) -> float:
 def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
     """The wavelengths of a row, from 0; its integers 0 are the shortest and the longest."""
     wavelengths = planner.view.wavelengths
-    extremes = int(np.argmin(wavelengths)), int(np.argmax(wavelengths))
-    return tuple(n - 1 if n else extreme for n, extreme in zip(line.row.integers, extremes, strict=True))
+    first, second = line.row.integers
+    return first - 1 if first else int(np.argmin(wavelengths)), second - 1 if second else int(np.argmax(wavelengths))
 
 
 # -- Seidel ------------------------------------------------------------------------------------------------------------
 
 
-def _seidel(state: LensState, wavelength: int):
+def _seidel(state: LensState, wavelength: int) -> tuple[Number, ...]:
     """S1 to S5 in mm, (K,) each, of surfaces 1 to the last before the image."""
     n, c = state.index(wavelength), state.vertex_curvature
     surfaces = range(1, len(c) - 1)
@@ -150,9 +152,9 @@ def _seidel(state: LensState, wavelength: int):
     y, (y_bar, slope) = state.marginal_height, chief_ray_of(state)
     omega, omega_bar = n[0] * y / state.object_distance, n[0] * slope
     rays = [ynu(*ray, powers, gaps)[:-1] for ray in ((y, omega), (y_bar, omega_bar))]
-    marginal, chief = ([listed(column, state.count) for column in zip(*ray, strict=True)] for ray in rays)
+    marginal, chief = (tuple(listed(column, state.count) for column in zip(*ray, strict=True)) for ray in rays)
     vertex = listed(c[1:-1], state.count)
-    indices = [listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0)]
+    indices = tuple(listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0))
     invariant = omega_bar * y - omega * y_bar
     curvature, conic, a4 = (state.of_surfaces(name)[1:-1] for name in ("curvature", "conic", "a4"))
     departure = departure_from_sphere(curvature, 1 + conic, a4, vertex)
@@ -168,7 +170,7 @@ def _seidel_sum(lines: Sequence[Line], planner: Planner, *, which: int) -> Evalu
             raise BadRow(lines[0], f"is of even powers of r: surface {k} has other terms, added sag or a phase")
     share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
 
-    def number(context: EvaluationContext, line: Line):
+    def number(context: EvaluationContext, line: Line) -> Number:
         sums, surface = context.state.kept(_seidel, line.wavelength)[which], line.row.integers[0]
         total = sums[surface - 1] if surface else sums.sum()
         return total / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
@@ -184,7 +186,7 @@ def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
     planned = [(rows, plan(rows, planner)) for rows, plan in plans if rows]
 
     def evaluate(context: EvaluationContext) -> RowValues:
-        numbers = {}
+        numbers: dict[int, Number] = {}
         for rows, values_of in planned:
             values = values_of(context).values
             numbers |= {line.number: values[k] for k, line in enumerate(rows)}
@@ -217,13 +219,13 @@ def _distortion_of(lines: Sequence[Line], planner: Planner, fields: Sequence[tup
             return [*torch.where(curve.valid[range(len(waves)), waves], error, torch.nan)]
 
         return _by_analysis(errors)
-    close = [tuple(NEAR_AXIS * part for part in field) for field in fields]
+    close = [(NEAR_AXIS * x, NEAR_AXIS * y) for x, y in fields]
     far, near = (
-        np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, at, strict=True)])
-        for at in (fields, close)
+        np.array([_chief(line, planner, field, line.wavelength) for line, field in zip(lines, places, strict=True)])
+        for places in (fields, close)
     )
     meridian = np.array([along(field) for field in fields]).T
-    extent, close_extent = (np.array([_extent(planner, field) for field in at]) for at in (fields, close))
+    extent, close_extent = (np.array([_extent(planner, field) for field in places]) for places in (fields, close))
 
     def evaluate(context: EvaluationContext) -> RowValues:
         hits, close_hits = context.hits(far), context.hits(near)
@@ -258,7 +260,7 @@ def _largest_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
 
 def _fields_of(line: Line, planner: Planner) -> list[tuple[float, float]]:
-    """The field of a row, or as many up to it as the number in the column of Hy counts with the axis."""
+    """The field of a row; with a number in the column of Hy so many fields from the axis to it, the axis left out."""
     x, y = field_of(planner, line.row.integers[0])
     last = max(round(line.row.numbers[1]) - 1, 1)
     return [(k / last * x, k / last * y) for k in range(1, last + 1)]
@@ -274,10 +276,10 @@ def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     parts = [(k + 1) / steps for k in range(steps)]
     theta = np.deg2rad(largest) * np.array(parts)
 
-    def row(line: Line) -> Callable[[EvaluationContext], object]:
+    def row(line: Line) -> RowValue:
         rays = np.array([_chief(line, planner, (0.0, part), line.wavelength) for part in parts])
 
-        def number(context: EvaluationContext):
+        def number(context: EvaluationContext) -> Number:
             hits = context.hits(rays)
             if not hits.valid.all():
                 return np.nan

@@ -9,7 +9,7 @@ from functools import reduce
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.numerics import Dual, Number, value_of
 from raytrace.optimization.lens_state import listed
 from raytrace.optimization.operands.operand import (
     SETTINGS,
@@ -45,7 +45,7 @@ def _two(line: Line, rows: Sequence[Row]) -> list[int]:
 
 
 def _range(line: Line, rows: Sequence[Row]) -> list[int]:
-    """All between two that have a value; the ends may be text."""
+    """The numbers of all rows of a range that have a value; its ends may be text."""
     first, last = sorted(line.row.integers)
     if first < 1 or last > len(rows):
         raise BadRow(line, f"takes the values of rows {first} to {last}: there are rows 1 to {len(rows)}{_ADDED}")
@@ -71,7 +71,7 @@ def _operand(function: Callable, refers: Callable, text: str, convention: str = 
     return Operand(plan, text, convention=convention, refers=refers, bounds=bounds)
 
 
-def _finite(number):
+def _finite(number: Number) -> Number:
     """nan for an infinite number, with a derivative of 0."""
     if isinstance(number, Dual):
         return Dual(_finite(number.value), np.where(np.isfinite(number.slope), number.slope, 0.0))
@@ -98,16 +98,16 @@ def _folded(function: Callable) -> Callable:
     return lambda row, *values: reduce(function, values)
 
 
-def _above(row: Row, a):
+def _above(row: Row, a: Number) -> Number:
     return np.maximum(a, row.target)
 
 
-def _below(row: Row, a):
+def _below(row: Row, a: Number) -> Number:
     return np.minimum(a, row.target)
 
 
-def _spread(row: Row, *values):
-    """target + Σ (|v - mean| - target) over those further from the mean than the target."""
+def _spread(row: Row, *values: Number) -> Number:
+    """target + Σ (|v - mean| - target) over the values further from the mean than the target."""
     mean = sum(values) / len(values)
     return row.target + sum(np.maximum(np.abs(value - mean) - row.target, 0.0) for value in values)
 

@@ -2,7 +2,7 @@
 
 A row over several surfaces is its target if all of them comply, else less, or more, by the sum of their violations. Its
 error is 0, with zero derivatives, where the boundary is kept, and grows continuously where it is passed. Coordinate
-breaks are no surfaces here: a gap ends at the next surface that is none. A surface that closes before its semi-diameter
+breaks are skipped: a gap ends at the next other surface. A surface that closes before its semi-diameter
 has no edge: the difference is a violation of every row of edges, least or largest.
 
 The edge of a row is where OpticStudio has it, each surface at its own semi-diameter; where the last of its four numbers
@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from raytrace.materials.glass import is_air
-from raytrace.maths.numerics import Dual, polynomial, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, polynomial, slope_of, value_of
 from raytrace.optimization.lens_state import Bundle, LensState, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,
@@ -29,7 +30,7 @@ from raytrace.optimization.operands.operand import (
     RowValues,
     once_a_context,
 )
-from raytrace.system.lens import media
+from raytrace.system.lens import Lens, media
 from raytrace.system.shapes import EVEN, conic_sag
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
 from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, rims, semi_diameter_margin
@@ -46,7 +47,7 @@ class SemiDiameters:
 
     def __init__(self, planner: Planner):
         self.view, surfaces = planner.view, planner.lens.surfaces
-        #: mm, by surface, of those that do not follow the rays; the object's is 0 by default.
+        #: Semi-diameters in mm that do not follow the rays, by surface; that of the object is 0 by default.
         self.fixed = {0: surfaces[0].semi_diameter or 0.0} | fixed_semi_diameters(planner.lens)
         self.factors, self.lengths = np.array([semi_diameter_margin(planner.lens, k) for k in range(len(surfaces))]).T
         self.asked: set[int] = set()
@@ -57,8 +58,8 @@ class SemiDiameters:
         self.asked |= set(surfaces)
 
     @once_a_context
-    def at(self, context: EvaluationContext):
-        """mm (S,) of all surfaces; nan of those without a row, and where no ray arrives."""
+    def at(self, context: EvaluationContext) -> Number:
+        """Semi-diameters in mm (S,) of all surfaces; nan of surfaces without a row, and where no ray arrives."""
         sizes = np.full(len(self.factors), np.nan)
         slopes = np.zeros((context.state.count, len(sizes)))
         if follow := sorted(self.asked - set(self.fixed)):
@@ -78,7 +79,7 @@ class SemiDiameters:
         ray, rows = heights.argmax(-1), np.arange(len(places))
         largest = heights[rows, ray]
         largest = np.where(largest < 0, np.nan, largest)
-        if marks.by_x is None:
+        if marks.by_x is None or marks.by_y is None:
             return largest, None
         cosine, sine = (part[rows, ray] / np.where(largest > 0, largest, 1.0) for part in (x, y))
         by_x, by_y = (part[places, :, ray] for part in (marks.by_x, marks.by_y))
@@ -101,7 +102,7 @@ class SemiDiameters:
 #: The point on the edge of a surface, by the code of a row: +y, +x, -y, -x.
 SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 
-#: What the code of a row at the common rim has in addition, and the numbers of such a row.
+#: Offset of the code of a row at the common rim, and the numbers of such a row.
 RIM, AT_RIM = len(SIDES), (0.0, 0.0, 0.0, 1.0)
 
 _EDGE = 1e-4  # of 1 - (1+k) c² s²: from where the root of a conic is continued
@@ -129,9 +130,10 @@ class Gaps:
         self.others = [k for k, surface in enumerate(surfaces) if not (surface.is_break or _is_even(surface))]
 
     @once_a_context
-    def centre(self, context: EvaluationContext):
-        """mm on the axis, signed like the lens's."""
-        each = total = context.state.of_surfaces("thickness")
+    def centre(self, context: EvaluationContext) -> Number:
+        """Thickness in mm on the axis, signed as in the lens."""
+        each: Number = context.state.of_surfaces("thickness")
+        total = each
         start = np.arange(len(self.end))
         for step in range(1, int((self.end - start).max())):
             within = start + step < self.end
@@ -139,27 +141,28 @@ class Gaps:
         return total
 
     @once_a_context
-    def edge(self, context: EvaluationContext, code: int):
-        """mm at the edge; code: the number of a side in `SIDES`, plus RIM at the common rim."""
+    def edge(self, context: EvaluationContext, code: int) -> Number:
+        """Thickness in mm at the edge; code: the number of a side in `SIDES`, plus RIM at the common rim."""
         return edge_thickness(self.centre(context), *self.sags(context, code))
 
-    def whole(self, context: EvaluationContext, code: int):
-        """mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
+    def whole(self, context: EvaluationContext, code: int) -> Number:
+        """Thickness in mm along the axis between the extreme points of both surfaces, at the centre or at the edge."""
         front, back = self.sags(context, code)
         return self.centre(context) + (np.maximum(back, 0.0) - np.minimum(front, 0.0))
 
     @once_a_context
-    def sags(self, context: EvaluationContext, code: int) -> tuple:
-        """mm (S,) of the surfaces on both sides of every gap, each at its own semi-diameter or both at the rim."""
+    def sags(self, context: EvaluationContext, code: int) -> tuple[Number, Number]:
+        """Sags in mm (S,) of the surfaces on both sides of every gap, at their own semi-diameters or at the rim."""
         sizes, every = self.semi_diameters.at(context), np.arange(len(self.end))
         if code < RIM:
-            own = self._sag(context, code, every, sizes)
-            return own, own[self.end]
+            sags_there = self._sag(context, code, every, sizes)
+            return sags_there, sags_there[self.end]
         rim = rims(sizes, self.end, ~self.is_air & (self.end > every))
-        return tuple(self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
+        front, back = (self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
+        return front, back
 
-    def _sag(self, context: EvaluationContext, code: int, surfaces: np.ndarray, heights):
-        """mm (S,) of surfaces at heights (S,)."""
+    def _sag(self, context: EvaluationContext, code: int, surfaces: np.ndarray, heights: Number) -> Number:
+        """Sag in mm (S,) of surfaces at heights (S,)."""
         state, (x, y) = context.state, SIDES[code]
         sag = self._even_sag(state, surfaces, heights)
         asked = np.flatnonzero(np.isin(surfaces, self.others) & ~np.isnan(value_of(heights)))
@@ -173,8 +176,8 @@ class Gaps:
         return Dual(values, slopes) if state.count else values
 
     @once_a_context
-    def shortfall(self, context: EvaluationContext):
-        """mm by which surfaces fall short of their semi-diameters s, below 0 where they reach them: s (q - 1)/2.
+    def shortfall(self, context: EvaluationContext) -> Number:
+        """Length in mm by which surfaces fall short of their semi-diameters s, negative if not: s (q - 1)/2.
 
         q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
         """
@@ -182,12 +185,12 @@ class Gaps:
         every = np.arange(len(self.end))
         return 0.5 * heights * (self._closing(context.state, every, heights * heights) - 1.0)
 
-    def _closing(self, state: LensState, surfaces: np.ndarray, u):
+    def _closing(self, state: LensState, surfaces: np.ndarray, u: Number) -> Number:
         """(1+k) c² u, which is 1 at the edge of a closed conic."""
         c = state.of_surfaces("curvature")[surfaces]
         return (1 + state.of_surfaces("conic")[surfaces]) * (c * c) * u
 
-    def _even_sag(self, state: LensState, surfaces: np.ndarray, heights):
+    def _even_sag(self, state: LensState, surfaces: np.ndarray, heights: Number) -> Number:
         """c u/(1 + √(1 - q)) + Σ a_j u^j, u = s², q = (1+k) c² u.
 
         Of a conic that closes within s, from 1 - q = ε on, 1 - q is ε/(1 + τ + τ²), τ = 1 - (1 - q)/ε: above 0, with
@@ -202,15 +205,15 @@ class Gaps:
         sag = conic_sag(u, c, np.sqrt(left))
         return sag + u * polynomial([state.of_surfaces(name)[surfaces] for name in self.terms], u)
 
-    def slenderness(self, context: EvaluationContext):
+    def slenderness(self, context: EvaluationContext) -> Number:
         """Diameter over centre thickness of glasses."""
         thickness = np.where(self.is_air, 1.0, self.side * self.centre(context))
         return 2.0 * self.semi_diameters.at(context) / thickness
 
-    def of_glass(self, context: EvaluationContext, number: Callable):
+    def of_glass(self, context: EvaluationContext, number: Callable[..., Tensor]) -> Number:
         """A number of the glasses behind the surfaces, of their indices at the lines d, F and C."""
 
-        def numbers(lens) -> list:
+        def numbers(lens: Lens) -> list[Tensor]:
             indices = media(lens, lens.wavelengths.new_tensor([0.5875618, 0.4861327, 0.6562725]))
             pairs = zip(indices, self.is_air, strict=True)
             return [torch.zeros(()) if air else number(*n.expand(3)) for n, air in pairs]
@@ -229,7 +232,7 @@ class Amount(NamedTuple):
     length: its power of length; needs: of the surfaces of rows, "edges" of the gaps behind them, or "semi-diameters".
     """
 
-    number: Callable[[Gaps, EvaluationContext, int], object]
+    number: Callable[[Gaps, EvaluationContext, int], Number]
     length: int = 0
     needs: str = ""
 
@@ -293,15 +296,15 @@ class _Places:
                 self.gaps.semi_diameters.ask(range(1, len(self.gaps.end)))
 
     def values(self, context: EvaluationContext) -> np.ndarray:
-        """Without derivatives."""
+        """The amounts (P,) without derivatives."""
         values = np.zeros(len(self.rows))
         for code in self.each:
             same = self.codes == code
             values[same] = value_of(self.amount.number(self.gaps, context, code))[self.surfaces[same]]
         return values
 
-    def at(self, context: EvaluationContext, places: np.ndarray):
-        """Those of some places, with derivatives."""
+    def at(self, context: EvaluationContext, places: np.ndarray) -> Number:
+        """The amounts of some places, with derivatives."""
         numbers = np.zeros(len(places))
         for code in self.each:
             each = self.amount.number(self.gaps, context, code)[self.surfaces[places]]
@@ -310,7 +313,7 @@ class _Places:
 
 
 def _largest_violations(violated: np.ndarray, rows: np.ndarray, violations: np.ndarray) -> np.ndarray:
-    """Of every row the place of the largest violation."""
+    """The place of the largest violation of every row."""
     order = violated[np.argsort(-violations[violated], kind="stable")]
     return order[np.unique(rows[order], return_index=True)[1]]
 
@@ -329,12 +332,14 @@ def _within(
     rows = places.rows if ends is None else np.concatenate([places.rows, ends.rows])
     surfaces = places.surfaces if ends is None else np.concatenate([places.surfaces, ends.surfaces])
 
-    def with_derivatives(context: EvaluationContext, some: np.ndarray):
+    def with_derivatives(context: EvaluationContext, some: np.ndarray) -> Number:
         """The violations of some places."""
         first = some[some < len(places.rows)]
         violations = side * (targets[places.rows[first]] - places.at(context, first))
         further = some[some >= len(places.rows)] - len(places.rows)
-        return np.concatenate([violations, ends.at(context, further)]) if len(further) else violations
+        if ends is None or not len(further):
+            return violations
+        return np.concatenate([violations, ends.at(context, further)])
 
     def evaluate(context: EvaluationContext) -> RowValues:
         violations = side * (targets[places.rows] - places.values(context))

@@ -6,9 +6,9 @@ with their derivatives by torch.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from raytrace.analysis.mtf import clear_circle, cutoff, mtf_on_grid
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.analysis.setting import scene_of
-from raytrace.maths.numerics import Dual, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, slope_of, value_of
 from raytrace.optimization.operands.operand import (
     BadRow,
     Evaluate,
@@ -26,6 +26,7 @@ from raytrace.optimization.operands.operand import (
     Operand,
     OrLost,
     Planner,
+    RowValue,
     per_row,
 )
 from raytrace.optimization.operands.paraxial import image_index
@@ -61,7 +62,7 @@ def _field_part(planner: Planner, number: int) -> tuple[float, float]:
     return float(fields.x[number]) / largest, float(fields.y[number]) / largest
 
 
-def _scene(lens: Lens, number: int, colours: Sequence[int]) -> Scene:
+def _scene(lens: Lens, number: int, colours: Iterable[int]) -> Scene:
     """The scene of a field and some of the wavelengths."""
     field = torch.stack([lens.fields.x, lens.fields.y])[:, number, None]
     return dataclasses.replace(scene_of(lens, field), wavelengths=lens.wavelengths[list(colours)])
@@ -104,7 +105,7 @@ class Pupil:
 
     @property
     def kind(self) -> tuple:
-        """Beams of one kind are evaluated together."""
+        """The kind of the beam; beams of one kind are evaluated together."""
         return self.layout.degree, self.layout.half, len(self.colours)
 
     def turned(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,22 +124,27 @@ def _symmetry(planner: Planner, number: int) -> tuple[bool, bool]:
     return mirrored, mirrored and float(fields.y[number]) == 0 and vdy == 0 and vcx == vcy
 
 
+#: Numbers and their slopes behind an axis of variables.
+Slopes: TypeAlias = tuple[np.ndarray, np.ndarray]
+
+
 class Waves(NamedTuple):
     """The waves of beams: `wave` (B, R) in waves, `directions` s (2, B, R) in 1/mm, `places` (2, B) mm of chief rays on
     the image, each with its slopes behind an axis of variables, or None; blur: mm; valid: (B, R)."""
 
-    wave: tuple[np.ndarray, np.ndarray]
-    directions: tuple[np.ndarray, np.ndarray]
-    places: tuple[np.ndarray, np.ndarray]
+    wave: Slopes
+    directions: Slopes
+    places: Slopes
     blur: np.ndarray
     valid: np.ndarray
 
     def of(self, rows: np.ndarray) -> "Waves":
-        """Those of some beams."""
-        wave, directions = (tuple(part[..., rows, :] for part in pair) for pair in (self.wave, self.directions))
+        """The waves of some beams."""
+        (wave, by_wave), (s, by_s), (place, by_place) = self.wave, self.directions, self.places
         return Waves(
-            wave, directions, tuple(part[..., rows] for part in self.places), self.blur[rows], self.valid[rows]
-        )
+            (wave[..., rows, :], by_wave[..., rows, :]), (s[..., rows, :], by_s[..., rows, :]),
+            (place[..., rows], by_place[..., rows]), self.blur[rows], self.valid[rows],
+        )  # fmt: skip
 
 
 def waves_of(context: EvaluationContext, beams: Sequence[Pupil]) -> Waves:
@@ -171,7 +177,9 @@ def _turned(beams: Sequence[Pupil], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Components (..., B, R) of all rays, one beam after the other: (2, ..., B, R)."""
     size = len(beams[0].colours)
     places = [(..., slice(k * size, (k + 1) * size), slice(None)) for k in range(len(beams))]
-    return np.concatenate([np.stack(beam.turned(x[at], y[at])) for beam, at in zip(beams, places, strict=True)], -2)
+    return np.concatenate(
+        [np.stack(beam.turned(x[chosen], y[chosen])) for beam, chosen in zip(beams, places, strict=True)], -2
+    )
 
 
 def modulations(
@@ -190,14 +198,16 @@ def modulations(
         chosen = np.flatnonzero(suffice)
         some = waves.of((chosen[:, None] * colours + np.arange(colours)).ravel())
         fit = Fit(beams[0].layout, some.wave[0], some.directions[0])
-        shares = np.stack([beams[k].shares for k in chosen])
+        shares = np.stack([beams[k].shares for k in chosen.tolist()])
         points = int(rule[chosen].max())
         values[chosen], slopes[:, chosen] = _modulated(fit, some, sections, shares, points, context.state.count)
         suffice[chosen] &= (fit.missed.reshape(-1, colours) < _MISSED).all(-1)
     return (Dual(values, slopes) if context.state.count else values), suffice
 
 
-def _modulated(fit: Fit, waves: Waves, sections: Sequence[Section], shares: np.ndarray, points: int, count: int):
+def _modulated(
+    fit: Fit, waves: Waves, sections: Sequence[Section], shares: np.ndarray, points: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """MTF (F, Q), and its slopes (n, F, Q)."""
     fields, colours = shares.shape
     axes = np.array([section.axis for section in sections])
@@ -258,12 +268,12 @@ class Wave:
         frequencies = sorted({frequency for frequency, _ in self.asked})
         scene, shares = _scene(lens, self.field, self.colours), _shares(self.colours, lens.wavelengths)
         both = mtf_on_grid(scene, lens.wavelengths.new_tensor(frequencies), shares, least=self.least)
-        at = {frequency: k for k, frequency in enumerate(frequencies)}
-        return [sum(share * m[0, at[f]] for share, m in zip(_SHARES[s], both, strict=True)) for f, s in self.asked]
+        columns = {frequency: k for k, frequency in enumerate(frequencies)}
+        return [_mean(s, lambda axis, k=columns[f]: both[1 - axis][0, k]) for f, s in self.asked]
 
     def __call__(self, context: EvaluationContext) -> Sequence | None:
         if self._last[0] is not context:
-            numbers = context.once(_by_few_rays, self.planner.shared(AllWaves)).get(self)
+            numbers: Sequence | None = context.once(_by_few_rays, self.planner.shared(AllWaves)).get(self)
             if numbers is None:
                 numbers = self._on_grid(context)
             else:
@@ -276,7 +286,8 @@ class AllWaves:
     """The waves of all rows of modulation in a configuration."""
 
     def __init__(self, planner: Planner):
-        self.planner, self._waves = planner, {}
+        self.planner = planner
+        self._waves: dict[tuple, Wave] = {}
 
     def of(self, line: Line) -> Wave:
         key = line.row.integers, line.row.numbers[0]
@@ -285,7 +296,7 @@ class AllWaves:
         return self._waves[key]
 
     def by_kind(self) -> list[list[Wave]]:
-        """Those that are evaluated together."""
+        """The waves that are evaluated together."""
         kinds: dict[tuple, list[Wave]] = {}
         for wave in self._waves.values():
             kinds.setdefault(wave.beam.kind, []).append(wave)
@@ -299,16 +310,16 @@ def _by_few_rays(context: EvaluationContext, waves: AllWaves) -> dict[Wave, list
         asked = {(f, axis) for wave in some for f, s in wave.asked for axis in range(2) if _SHARES[s][1 - axis]}
         sections = [Section(*each) for each in sorted(asked)]
         modulation, suffice = modulations(context, [wave.beam for wave in some], sections)
-        at = {section: k for k, section in enumerate(sections)}
+        columns = {section: k for k, section in enumerate(sections)}
         for k in np.flatnonzero(suffice):
-            by_section = {section: modulation[k][place] for section, place in at.items()}
+            by_section = {section: modulation[k][place] for section, place in columns.items()}
             numbers[some[k]] = [
-                _mean(s, lambda axis, f=f, of=by_section: of[Section(f, axis)]) for f, s in some[k].asked
+                _mean(s, lambda axis, f=f, values=by_section: values[Section(f, axis)]) for f, s in some[k].asked
             ]
     return numbers
 
 
-def _mean(section: str, modulation: Callable[[int], object]):
+def _mean(section: str, modulation: Callable[..., Number]) -> Number:
     """The MTF of a section, or the mean of both, of the modulation along an axis."""
     return sum(share * modulation(axis) for axis, share in zip((1, 0), _SHARES[section], strict=True) if share)
 
@@ -316,7 +327,7 @@ def _mean(section: str, modulation: Callable[[int], object]):
 def _by_waves(lines: Sequence[Line], planner: Planner, *, section: str) -> Evaluate:
     """The MTF of diffraction along one section of the pupil, or the mean of both."""
 
-    def row(line: Line) -> Callable[[EvaluationContext], object]:
+    def row(line: Line) -> RowValue:
         _check(line)
         wave = planner.shared(AllWaves).of(line)
         return _entry(wave, wave.ask(line.row.numbers[1], section))
@@ -324,10 +335,10 @@ def _by_waves(lines: Sequence[Line], planner: Planner, *, section: str) -> Evalu
     return per_row(map(row, lines))
 
 
-def _entry(numbers: Callable[[EvaluationContext], Sequence | None], place: int = 0) -> Callable:
-    """One of the numbers of a context, nan if there are none."""
+def _entry(numbers: Callable[[EvaluationContext], Sequence | None], place: int = 0) -> RowValue:
+    """The number at a place among those of a context; nan if there are none."""
 
-    def number(context: EvaluationContext):
+    def number(context: EvaluationContext) -> Number:
         values = numbers(context)
         return np.nan if values is None else values[place]
 
@@ -335,7 +346,7 @@ def _entry(numbers: Callable[[EvaluationContext], Sequence | None], place: int =
 
 
 def _check(line: Line) -> None:
-    """Raises BadRow."""
+    """Check sampling and frequency. Raises BadRow."""
     if not 1 <= line.row.integers[0] <= 6:
         raise BadRow(line, f"has the sampling {line.row.integers[0]}: expected 1 to 6")
     if not line.row.numbers[1] > 0:
@@ -345,9 +356,9 @@ def _check(line: Line) -> None:
 
 
 def _strehl_ratio(lines: Sequence[Line], planner: Planner) -> Evaluate:
-    """Of one wavelength, or the mean of all by weight."""
+    """The Strehl ratio of one wavelength, or the weighted mean of all."""
 
-    def row(line: Line) -> Callable[[EvaluationContext], object]:
+    def row(line: Line) -> RowValue:
         field, colours = _field_number(line, planner), colours_of(line, planner)
 
         def ratio(lens: Lens) -> list[Tensor]:
@@ -367,7 +378,7 @@ def _by_rays(section: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
     return lambda lines, planner: per_row(_of_rays(line, section, planner) for line in lines)
 
 
-def _of_rays(line: Line, section: str, planner: Planner) -> Callable[[EvaluationContext], object]:
+def _of_rays(line: Line, section: str, planner: Planner) -> RowValue:
     _check(line)
     frequency, colours = line.row.numbers[1], colours_of(line, planner)
     of_beam = dataclasses.replace(
@@ -381,13 +392,13 @@ def _of_rays(line: Line, section: str, planner: Planner) -> Callable[[Evaluation
         parts = clear_circle(frequency / cutoff(lens, lens.wavelengths[list(colours)]))
         return [(_shares(colours, parts) * parts).sum()]
 
-    def modulation(weights: np.ndarray, place):
+    def modulation(weights: np.ndarray, place: Number) -> Number:
         # As `analysis.mtf` by real numbers: dual numbers are real, and torch would take a pass for each of many rays.
         phase = 2 * np.pi * frequency * (place - weights @ place)
         real, imaginary = weights @ np.cos(phase), weights @ np.sin(phase)
         return np.sqrt(real * real + imaginary * imaginary)
 
-    def number(context: EvaluationContext):
+    def number(context: EvaluationContext) -> Number:
         hits = context.hits(beam.rays, clips=True)
         weights = beam.weights(hits.valid)
         if weights is None:

@@ -8,12 +8,12 @@ variables.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import torch
 
-from raytrace.maths.numerics import Dual, value_of
+from raytrace.maths.numerics import Dual, Number, value_of
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, View, listed
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
@@ -51,7 +51,7 @@ class Conventions:
     seidel: str = "coefficients"
     f_theta: str = "axis left out"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"convention `{name}` {getattr(self, name)!r}: expected one of {', '.join(known)}")
@@ -132,16 +132,22 @@ class RowValues(NamedTuple):
     surface (K,).
     """
 
-    values: object
-    parts: tuple = ()
-    sides: tuple = ()
+    values: Number
+    parts: tuple[Number, ...] = ()
+    sides: tuple[()] | tuple[np.ndarray, Number, np.ndarray] = ()
 
 
 #: Values of rows at a state; rows of arithmetic take those of earlier rows, by their number.
-Evaluate = Callable[["EvaluationContext"], RowValues]
+Evaluate: TypeAlias = Callable[["EvaluationContext"], RowValues]
 
 #: The evaluation of rows of one operand in one configuration.
-Plan = Callable[[Sequence[Line], "Planner"], Evaluate]
+Plan: TypeAlias = Callable[[Sequence[Line], "Planner"], Evaluate]
+
+#: The value of a row at a state.
+RowValue: TypeAlias = Callable[["EvaluationContext"], Number]
+
+Point: TypeAlias = tuple[float, float]
+Shared = TypeVar("Shared")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,9 +156,9 @@ class Operand:
 
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: description, with its arguments.
     length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
-    convention: the convention chosen where the field's own program leaves the meaning open.
+    convention: the convention chosen where OpticStudio leaves the meaning open.
     takes: the two integers of its rows, keys of `ARGUMENTS`; "" for one that is not read.
-    refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
+    refers: of an operand of arithmetic, the numbers of the rows whose values a row takes, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """
 
@@ -173,14 +179,20 @@ class Planner:
         self.view, self.lens, self.primary, self.conventions = view, view.lens, primary, conventions
         self.unit, self.rows = unit, rows
         self.bundles: dict[tuple[int, bool], Bundle] = {}
-        self._shared: dict = {}
+        self._shared: dict[Callable, Any] = {}
 
     @property
     def image(self) -> int:
         return len(self.lens.surfaces) - 1
 
     def ray(
-        self, line: Line, *, surface: int | None = None, field=None, pupil=None, wavelength: int | None = None
+        self,
+        line: Line,
+        *,
+        surface: int | None = None,
+        field: Point | None = None,
+        pupil: Point | None = None,
+        wavelength: int | None = None,
     ) -> int:
         """The number of the ray of a row behind a surface, the image by default. Raises BadRow."""
         number = line.wavelength if wavelength is None else wavelength
@@ -190,11 +202,19 @@ class Planner:
         last = self.image if surface is None else self.checked(line, surface)
         if last == 0 and not is_flat(self.lens.surfaces[0]):
             raise BadRow(line, "names surface 0, a curved or tilted object, on which rays are not evaluated")
-        of, at = line.field if field is None else field, line.pupil if pupil is None else pupil
-        return self.ask(number, of, at, surface=last)
+        of_field, of_pupil = line.field if field is None else field, line.pupil if pupil is None else pupil
+        return self.ask(number, of_field, of_pupil, surface=last)
 
-    def ask(self, wavelength: int, field, pupil, *, surface: int | None = None, clips: bool = False) -> int:
-        """The number of any ray behind a surface, the image by default; clips: of those that apertures may stop."""
+    def ask(
+        self,
+        wavelength: int,
+        field: Point,
+        pupil: Point,
+        *,
+        surface: int | None = None,
+        clips: bool = False,
+    ) -> int:
+        """The number of a ray behind a surface, the image by default; clips: whether apertures may stop it."""
         last = self.image if surface is None else surface
         if (last, clips) not in self.bundles:
             self.bundles[last, clips] = Bundle(self.view.clipping if clips else self.view, last)
@@ -206,10 +226,10 @@ class Planner:
             raise BadRow(line, f"names surface {surface}: this lens has surfaces 0 to {self.image}")
         return surface
 
-    def rays(self, lines: Sequence[Line], **options) -> np.ndarray:
+    def rays(self, lines: Sequence[Line], **options: Any) -> np.ndarray:
         return np.array([self.ray(line, **options) for line in lines])
 
-    def shared(self, kind: type):
+    def shared(self, kind: Callable[["Planner"], Shared]) -> Shared:
         """The instance of a class that rows of several operands share, made of the planner."""
         if kind not in self._shared:
             self._shared[kind] = kind(self)
@@ -219,12 +239,12 @@ class Planner:
 class EvaluationContext:
     """The lens in one configuration at given variables: its state and its rays, traced when they are first needed."""
 
-    def __init__(self, planner: Planner, state: LensState, values: dict[int, object]):
+    def __init__(self, planner: Planner, state: LensState, values: dict[int, Number]) -> None:
         self.planner, self.state, self.values = planner, state, values
         self._hits: dict[tuple[int, bool], Hits] = {}
-        self._once: dict = {}
+        self._once: dict[tuple, Any] = {}
 
-    def once(self, function: Callable, *arguments):
+    def once(self, function: Callable[..., Shared], *arguments: Any) -> Shared:
         """function(context, *arguments), computed once."""
         key = function, *arguments
         if key not in self._once:
@@ -233,38 +253,38 @@ class EvaluationContext:
 
     def hits(self, rays: np.ndarray, *, surface: int | None = None, clips: bool = False) -> Hits:
         """Rays by their numbers behind a surface, the image by default; surface, clips: those of `Planner.ask`."""
-        at = self.planner.image if surface is None else surface, clips
-        if at not in self._hits:
-            self._hits[at] = self.planner.bundles[at].hits(self.state)
-        return self._hits[at].at(rays)
+        of_surface = self.planner.image if surface is None else surface, clips
+        if of_surface not in self._hits:
+            self._hits[of_surface] = self.planner.bundles[of_surface].hits(self.state)
+        return self._hits[of_surface].at(rays)
 
     def starts(self, rays: np.ndarray, surface: int) -> Hits:
         """Rays behind a surface at their launch, before surface 1 and in its axes."""
         return self.planner.bundles[surface, False].starts(self.state).at(rays)
 
 
-def once_a_context(method: Callable) -> Callable:
+def once_a_context(method: Callable[..., Shared]) -> Callable[..., Shared]:
     """A method of a context and further arguments, computed once in each context."""
 
-    def call(context: EvaluationContext, instance, *arguments):
+    def call(context: EvaluationContext, instance: Any, *arguments: Any) -> Shared:
         return method(instance, context, *arguments)
 
     @functools.wraps(method)
-    def cached(instance, context: EvaluationContext, *arguments):
+    def cached(instance: Any, context: EvaluationContext, *arguments: Any) -> Shared:
         return context.once(call, instance, *arguments)
 
     return cached
 
 
-def known(valid: np.ndarray, number):
-    """nan where a ray is lost."""
+def known(valid: np.ndarray, number: Number) -> Number:
+    """A number (R,) of rays, nan where a ray is lost."""
     if isinstance(number, Dual):
         return Dual(np.where(valid, value_of(number), np.nan), number.slope)
     return np.where(valid, number, np.nan)
 
 
-def per_row(numbers: Iterable[Callable[[EvaluationContext], object]]) -> Evaluate:
-    """The values of rows that share nothing, by a function of the context each."""
+def per_row(numbers: Iterable[RowValue]) -> Evaluate:
+    """The values of rows that are computed one by one, each by its function of the context."""
     numbers = [*numbers]
     return lambda context: RowValues(listed([number(context) for number in numbers], context.state.count))
 
@@ -274,7 +294,7 @@ def per_row(numbers: Iterable[Callable[[EvaluationContext], object]]) -> Evaluat
 
 @dataclasses.dataclass(frozen=True)
 class Argument:
-    """What an integer names: in words, the smallest and the largest, and what a smallest of 0 means."""
+    """An integer of a row: the thing that it numbers, its smallest and largest value, and the meaning of 0."""
 
     word: str
     first: Callable[[Lens], int]
@@ -286,7 +306,7 @@ def _image(lens: Lens) -> int:
     return len(lens.surfaces) - 1
 
 
-#: By the names of `Operand.takes`.
+#: Kinds of integers, by the names of `Operand.takes`.
 ARGUMENTS = {
     "surface": Argument("surface", lambda lens: 0, _image, "the object"),
     "place": Argument("surface", lambda lens: int(is_at_infinity(lens)), _image, "the object, at a finite distance"),
@@ -346,7 +366,7 @@ def measured(function: Callable[[Lens], torch.Tensor]) -> Operand:
     """The operand of rows of a `Measure`, or of a plain function."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        is_scalar = []
+        is_scalar: list[bool] = []
 
         def numbers(lens: Lens) -> Sequence[torch.Tensor]:
             result = function(lens)
@@ -359,7 +379,7 @@ def measured(function: Callable[[Lens], torch.Tensor]) -> Operand:
         numbers_or_none = OrLost(lines[0], lambda context: context.state.through_torch(numbers, clips=True))
 
         def evaluate(context: EvaluationContext) -> RowValues:
-            def alike(number):
+            def alike(number: Number) -> Number:
                 return listed([number] * len(lines), context.state.count)
 
             parts = numbers_or_none(context)
@@ -391,12 +411,12 @@ class OrLost:
 
 
 class Operands(dict[str | Callable, Operand]):
-    """Operands by name; a function of a lens stands for itself."""
+    """Operands by name; the operand of a function of a lens is made from it."""
 
-    def __contains__(self, operand) -> bool:
+    def __contains__(self, operand: object) -> bool:
         return callable(operand) or super().__contains__(operand)
 
-    def __missing__(self, operand) -> Operand:
+    def __missing__(self, operand: object) -> Operand:
         if not callable(operand):
             raise KeyError(operand)
         return measured(operand)

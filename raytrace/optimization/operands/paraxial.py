@@ -3,12 +3,12 @@
 At the primary wavelength, or that of the row. Signs and formulas are those of `tracing.paraxial`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import numpy as np
 
-from raytrace.maths.numerics import Dual, quotient, value_of
+from raytrace.maths.numerics import Dual, Number, quotient, value_of
 from raytrace.optimization.lens_state import LensState, listed
 from raytrace.optimization.operands.operand import (
     Evaluate,
@@ -17,6 +17,7 @@ from raytrace.optimization.operands.operand import (
     Operand,
     Plan,
     Planner,
+    RowValue,
     RowValues,
     known,
     need,
@@ -28,45 +29,49 @@ from raytrace.tracing.paraxial import largest_field as outermost_field
 _RIM = 32  # rays of the outline of a cone
 
 
-def _one_by_one(number: Callable[[EvaluationContext, Line], object]) -> Plan:
+def _one_by_one(number: Callable[[EvaluationContext, Line], Number]) -> Plan:
     """The plan of rows whose values are a function of the context and the row."""
-    return lambda lines, planner: per_row(lambda context, line=line: number(context, line) for line in lines)
+    return lambda lines, planner: per_row(partial(_of_line, number, line) for line in lines)
 
 
-def _focal_length(context: EvaluationContext, line: Line):
+def _of_line(number: Callable[[EvaluationContext, Line], Number], line: Line, context: EvaluationContext) -> Number:
+    return number(context, line)
+
+
+def _focal_length(context: EvaluationContext, line: Line) -> Number:
     data = context.state.gaussian(line.wavelength)
     in_air = context.planner.conventions.focal_length == "in air"
     return quotient(-1.0, data.C) if in_air else data.effective_focal_length
 
 
-def _magnification(state: LensState, wavelength: int):
+def _magnification(state: LensState, wavelength: int) -> Number:
     return state.gaussian(wavelength).magnification(state.vergence_at(wavelength))
 
 
-def _image_na(state: LensState):
+def _image_na(state: LensState) -> Number:
     """n′ sin u′ of the paraxial marginal ray behind the lens."""
     data = state.gaussian(state.primary)
     slope = state.marginal_height * data.omega_behind(state.vergence) / data.n_image
     return np.abs(data.n_image * np.sin(np.arctan(slope)))
 
 
-def _object_na(state: LensState):
+def _object_na(state: LensState) -> Number:
     n = state.gaussian(state.primary).n_object
     return np.abs(n * np.sin(np.arctan(state.marginal_height / state.object_distance)))
 
 
-def paraxial_image_distance(state: LensState, wavelength: int):
+def paraxial_image_distance(state: LensState, wavelength: int) -> Number:
     """mm from the last surface before the image."""
     return state.gaussian(wavelength).image_distance(state.vergence_at(wavelength))
 
 
-def _largest_extent(state: LensState):
+def _largest_extent(state: LensState) -> Number:
     """Slope of the largest field at infinity, or mm of the object; real image heights are taken as paraxial."""
     largest = float(state.lens.fields.extent)
     return state.field_scale * (np.tan(np.deg2rad(largest)) if state.lens.fields.kind == "angle" else largest)
 
 
-def chief_ray_of(state: LensState) -> tuple:
+def chief_ray_of(state: LensState) -> tuple[Number, Number]:
     """(ȳ, ū) in front of surface 1 of the chief ray of the largest field, upwards, at every wavelength."""
     pupil = state.gaussian(state.primary).entrance_pupil_position
     return chief_ray(
@@ -75,7 +80,7 @@ def chief_ray_of(state: LensState) -> tuple:
     )  # fmt: skip
 
 
-def _image_height(state: LensState, wavelength: int):
+def _image_height(state: LensState, wavelength: int) -> Number:
     """Of the largest field, in the paraxial image: m h, or -n u/C of an object at infinity."""
     extent, data = _largest_extent(state), state.gaussian(wavelength)
     if state.is_at_infinity:
@@ -83,12 +88,12 @@ def _image_height(state: LensState, wavelength: int):
     return _magnification(state, wavelength) * extent
 
 
-def _total_thickness(context: EvaluationContext, line: Line):
+def _total_thickness(context: EvaluationContext, line: Line) -> Number:
     first, last = sorted(line.row.integers)
     return sum(context.state.thickness[first : last + 1])
 
 
-def _total_track(context: EvaluationContext, line: Line):
+def _total_track(context: EvaluationContext, line: Line) -> Number:
     """Between the leftmost and the rightmost vertex of surface 1 to the image, on a straight axis."""
     if context.planner.conventions.total_track == "sum":
         return sum(context.state.thickness[1:-1])
@@ -99,7 +104,7 @@ def _total_track(context: EvaluationContext, line: Line):
     return positions[int(np.argmax(values))] - positions[int(np.argmin(values))]
 
 
-def _petzval_curvature(state: LensState, wavelength: int):
+def _petzval_curvature(state: LensState, wavelength: int) -> Number:
     """1/mm of the surface on which an image without astigmatism lies: -n′ Σ c (n′ - n)/(n n′)."""
     n, c = state.index(wavelength), state.vertex_curvature
     last = len(c) - 1
@@ -109,7 +114,7 @@ def _petzval_curvature(state: LensState, wavelength: int):
 # -- cones of real rays ------------------------------------------------------------------------------------------------
 
 
-def image_index(context: EvaluationContext, wavelengths: Sequence[int]):
+def image_index(context: EvaluationContext, wavelengths: Iterable[int]) -> Number:
     """Index (R,) in front of the image at wavelengths, counted from 0."""
     indices = [np.abs(context.state.index(w)[-2]) for w in wavelengths]
     return listed(indices, context.state.count if any(isinstance(n, Dual) for n in indices) else 0)
@@ -143,7 +148,7 @@ def _across_rims(lines: Sequence[Line], planner: Planner, *, section: str) -> Ev
     def through(side: int) -> np.ndarray:
         each = zip(lines, fields, rims, waves, strict=True)
         return np.array(
-            [planner.ray(at, field=h, pupil=(side * x, side * y), wavelength=w) for at, h, (x, y), w in each]
+            [planner.ray(surface, field=h, pupil=(side * x, side * y), wavelength=w) for surface, h, (x, y), w in each]
         )
 
     ahead, back = through(1), through(-1)
@@ -165,11 +170,11 @@ def _effective_f_number(lines: Sequence[Line], planner: Planner) -> Evaluate:
     by_angle = column[(np.arange(_RIM)[:, None] - np.arange(_RIM)) % _RIM]  # of a function at even points of a circle
     around = by_angle * (2 * np.pi / _RIM)
 
-    def row(line: Line) -> Callable[[EvaluationContext], object]:
+    def row(line: Line) -> RowValue:
         field = field_of(planner, need(line, "field", round(line.row.numbers[0]), planner.lens))
         rays = np.array([planner.ray(line, field=field, pupil=point) for point in rim])
 
-        def number(context: EvaluationContext):
+        def number(context: EvaluationContext) -> Number:
             hits = context.hits(rays)
             if not hits.valid.all():
                 return np.nan
@@ -181,12 +186,20 @@ def _effective_f_number(lines: Sequence[Line], planner: Planner) -> Evaluate:
     return per_row(map(row, lines))
 
 
+def _of_state(number: Callable[[LensState], Number], context: EvaluationContext, line: Line) -> Number:
+    return number(context.state)
+
+
+def _at_wavelength(number: Callable[[LensState, int], Number], context: EvaluationContext, line: Line) -> Number:
+    return number(context.state, line.wavelength)
+
+
 _NA = "numerical aperture {}, by the paraxial marginal ray"
 _WORKING = "1/(n′ |d₊ - d₋|) of the directions of the rays through the {} rim"
 _OF_A_FIELD = "working F-number, of a field (0: the largest) and wavelength"
 
 #: Numbers of the lens: name, function of the state, text, power of length.
-_OF_STATE = (
+_OF_STATE: tuple[tuple[str, Callable[[LensState], Number], str, int], ...] = (
     ("ISNA", _image_na, _NA.format("n′ sin u′ behind the lens"), 0),
     ("OBSN", _object_na, _NA.format("n sin u in front of the lens"), 0),
     (
@@ -212,7 +225,7 @@ _OF_STATE = (
 )
 
 #: Numbers of the lens at the wavelength of the row, which ends each text.
-_AT_WAVELENGTH = (
+_AT_WAVELENGTH: tuple[tuple[str, Callable[[LensState, int], Number], str, int], ...] = (
     ("PMAG", _magnification, "paraxial magnification", 0),
     (
         "AMAG",
@@ -221,7 +234,7 @@ _AT_WAVELENGTH = (
         0,
     ),
     ("PIMH", _image_height, "height of the largest field in the paraxial image", 1),
-    ("PETZ", lambda *at: quotient(1.0, _petzval_curvature(*at)), "radius of the Petzval surface", 1),
+    ("PETZ", lambda *ray: quotient(1.0, _petzval_curvature(*ray)), "radius of the Petzval surface", 1),
     ("PETC", _petzval_curvature, "curvature of the Petzval surface", -1),
 )
 
@@ -234,12 +247,11 @@ PARAXIAL = {
         takes=("", "wavelength"),
     ),
     **{
-        name: Operand(_one_by_one(lambda context, line, number=number: number(context.state)), text, length)
-        for name, number, text, length in _OF_STATE
+        name: Operand(_one_by_one(partial(_of_state, number)), text, length) for name, number, text, length in _OF_STATE
     },
     **{
         name: Operand(
-            _one_by_one(lambda context, line, number=number: number(context.state, line.wavelength)),
+            _one_by_one(partial(_at_wavelength, number)),
             f"{text} at a wavelength",
             length,
             takes=("", "wavelength"),

@@ -1,4 +1,4 @@
-"""Operands of rays: where they land, in which direction they go, and their angles to surface normals."""
+"""Operands of rays: landing points, directions, and angles to surface normals."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -7,9 +7,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import Dual, dot, safe_sqrt, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, dot, safe_sqrt, slope_of, value_of
 from raytrace.optimization.lens_state import Hits
-from raytrace.optimization.operands.operand import Evaluate, EvaluationContext, Line, Operand, Planner, RowValues, known
+from raytrace.optimization.operands.operand import (
+    Evaluate,
+    EvaluationContext,
+    Line,
+    Operand,
+    Plan,
+    Planner,
+    RowValues,
+    known,
+)
 from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
@@ -50,19 +59,19 @@ def _from_chief(lines: Sequence[Line], planner: Planner, *, component: int | Non
 
     def evaluate(context: EvaluationContext) -> RowValues:
         hits, centre = context.hits(rays), context.hits(chief)
-        pairs = zip(_transverse(hits, part), _transverse(centre, part), strict=True)
-        return _distance(hits.valid & centre.valid, *(a - b for a, b in pairs), component)
+        (x, y), (x_chief, y_chief) = _transverse(hits, part), _transverse(centre, part)
+        return _distance(hits.valid & centre.valid, x - x_chief, y - y_chief, component)
 
     return evaluate
 
 
-def _transverse(hits: Hits, part: str) -> tuple:
+def _transverse(hits: Hits, part: str) -> tuple[Number, Number]:
     """x and y of the hits, or of the directions."""
     vector = hits.direction if part == "direction" else hits.position
     return vector[0], vector[1]
 
 
-def _distance(valid: np.ndarray, x, y, component: int | None) -> RowValues:
+def _distance(valid: np.ndarray, x: Number, y: Number, component: int | None) -> RowValues:
     x, y = known(valid, x), known(valid, y)
     return RowValues(np.sqrt(x * x + y * y), (x, y)) if component is None else RowValues((x, y)[component])
 
@@ -74,7 +83,7 @@ def _by_surface(
     lines: Sequence[Line],
     planner: Planner,
     *,
-    number: Callable[[EvaluationContext, Hits, int, np.ndarray], tuple[np.ndarray, object]],
+    number: Callable[..., tuple[np.ndarray, Number]],
     also_before: bool = False,
 ) -> Evaluate:
     """A number of the ray on the surface of the row, in the axes of its vertex.
@@ -82,16 +91,17 @@ def _by_surface(
     number: validity and values of the context, the hits and number of one surface, and the rays behind the surface
     before it (also_before) by their numbers.
     """
-    surfaces, rays = np.array([line.row.integers[0] for line in lines]), {}
+    surfaces = np.array([line.row.integers[0] for line in lines])
+    rays: dict[int, list[np.ndarray]] = {}
     for surface in set(surfaces.tolist()):
         here = [line for line in lines if line.row.integers[0] == surface]
-        rays[surface] = [planner.rays(here, surface=at) for at in range(surface - also_before, surface + 1)]
+        rays[surface] = [planner.rays(here, surface=k) for k in range(surface - also_before, surface + 1)]
 
     def evaluate(context: EvaluationContext) -> RowValues:
         count = context.state.count
         values, slopes = np.full(len(lines), np.nan), np.zeros((count, len(lines)))
-        for surface, (*before, at) in rays.items():
-            numbers = known(*number(context, context.hits(at, surface=surface), surface, *before))
+        for surface, (*before, ray) in rays.items():
+            numbers = known(*number(context, context.hits(ray, surface=surface), surface, *before))
             values[surfaces == surface] = value_of(numbers)
             slopes[:, surfaces == surface] = slope_of(numbers, count)
         return RowValues(Dual(values, slopes) if count else values)
@@ -99,30 +109,35 @@ def _by_surface(
     return evaluate
 
 
-def _at_surface(number: Callable[[Hits], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def _at_surface(number: Callable[[Hits], Number]) -> Plan:
     """A number of the ray behind the surface of the row."""
-    return partial(_by_surface, number=lambda context, hits, surface: (hits.valid, number(hits)))
+
+    def valid_number(context: EvaluationContext, hits: Hits, surface: int) -> tuple[np.ndarray, Number]:
+        return hits.valid, number(hits)
+
+    return partial(_by_surface, number=valid_number)
 
 
-def _radius(hits: Hits):
+def _radius(hits: Hits) -> Number:
     x, y, _ = hits.position
     return np.sqrt(x * x + y * y)
 
 
-def _axial_angle(hits: Hits):
+def _axial_angle(hits: Hits) -> Number:
     """Radians between the ray and z."""
     L, M, N = hits.direction
     return np.arctan(np.sqrt(L * L + M * M) / np.abs(N))
 
 
-def _to_normal(angle: Callable[[Tensor, Tensor], Tensor], *, behind: bool) -> Callable:
+def _to_normal(angle: Callable[[Tensor, Tensor], Tensor], *, behind: bool) -> Plan:
     """A function of |cosine| and sine of the angle between normal and ray, in front of the surface or behind it."""
 
-    def number(context: EvaluationContext, here: Hits, surface: int, *before: np.ndarray):
+    def number(context: EvaluationContext, here: Hits, surface: int, *before: np.ndarray) -> tuple[np.ndarray, Number]:
         ray = here if behind else context.hits(*before, surface=surface - 1)
 
         def of(lens: Lens, *numbers: Tensor) -> Tensor:
-            position, direction = numbers[:3], list(numbers[3:])
+            position: Sequence[Tensor] = numbers[:3]
+            direction: Sequence[Tensor] = numbers[3:]
             if not behind:  # from the axes of the surface before, or of a launched ray
                 gap = gap_behind(lens.surfaces[surface - 1]) if surface > 1 else None
                 for pose in (gap.pose if isinstance(gap, Gap) else None, lens.surfaces[surface].before):

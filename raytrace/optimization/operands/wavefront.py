@@ -9,11 +9,12 @@ the solver uses: smooth where the RMS is 0, and no second derivative is lost.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from torch import Tensor
 
-from raytrace.maths.numerics import Dual, Vector, dot, slope_of, value_of
+from raytrace.maths.numerics import Dual, Number, Vector, dot, slope_of, value_of
 from raytrace.maths.sampling import gauss_rings, square
 from raytrace.optimization.lens_state import Hits
 from raytrace.optimization.operands.operand import (
@@ -22,12 +23,15 @@ from raytrace.optimization.operands.operand import (
     EvaluationContext,
     Line,
     Operand,
+    Plan,
     Planner,
+    RowValue,
     RowValues,
     known,
     per_row,
 )
 from raytrace.optimization.operands.paraxial import image_index
+from raytrace.system.lens import Lens
 from raytrace.system.surface import is_flat
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.trace import is_bent
@@ -38,14 +42,16 @@ class Sphere(NamedTuple):
     """Reference spheres (...): centre, three of mm on the image; curvature κ = 1/R in 1/mm along the light."""
 
     centre: Vector
-    curvature: object
+    curvature: Number
 
     def at(self, places: np.ndarray) -> "Sphere":
         return Sphere(Vector(part[places] for part in self.centre), self.curvature[places])
 
 
 def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
-    """About where chief rays land, through the exit pupil of the primary wavelength; κ = 0 for one at infinity.
+    """Reference spheres about the image points of chief rays, through the exit pupil of the primary wavelength.
+
+    κ = 0 for a pupil at infinity.
 
         κ = D sign(v·d)/|v|,   v = D (C - E),   E_z = -n′ B/D - T
 
@@ -64,10 +70,10 @@ def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
     return Sphere(centre, side * weight / np.sqrt(dot(v, v)))
 
 
-def _pupil_on_base_ray(wavelength: int) -> Callable:
-    """Of a lens: where the base ray meets the image, its direction there, and the mean vergence 1/mm of the pupils."""
+def _pupil_on_base_ray(wavelength: int) -> Callable[[Lens], Sequence[Tensor]]:
+    """A function of a lens: image point and direction of the base ray, and the mean vergence of the pupils in 1/mm."""
 
-    def numbers(lens):
+    def numbers(lens: Lens) -> Sequence[Tensor]:
         base = base_ray(lens, lens.wavelengths[wavelength])
         return *base.position, *base.direction, 0.5 * (1 / base.exit_pupil_position).sum(0)
 
@@ -79,13 +85,13 @@ def _pupil_on_base_ray(wavelength: int) -> Callable:
 
 def opd_of(
     rays: np.ndarray, beams: Sequence[tuple], planner: Planner, *, clips: bool = False
-) -> Callable[[EvaluationContext], tuple[np.ndarray, object]]:
+) -> Callable[[EvaluationContext], tuple[np.ndarray, Number]]:
     """OPD (R,) in waves of rays by their numbers, and which of them and their chief rays arrive.
 
     beams: (wavelength from 0, field) of each; clips: whether apertures stop rays, though not chief rays.
     """
     numbers = {beam: number for number, beam in enumerate(dict.fromkeys(beams))}
-    of = np.array([numbers[beam] for beam in beams])
+    rows = np.array([numbers[beam] for beam in beams])
     chief = centres = np.array([planner.ask(w, field, (0.0, 0.0)) for w, field in numbers])
     if planner.conventions.opd_chief == "primary":
         centres = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in numbers])
@@ -94,17 +100,19 @@ def opd_of(
     waves = waves if planner.conventions.opd_sign == "longer" else -waves
     bent = is_bent(planner.lens)
 
-    def opd(context: EvaluationContext) -> tuple[np.ndarray, object]:
+    def opd(context: EvaluationContext) -> tuple[np.ndarray, Number]:
         hits, chief_hits, about = context.hits(rays, clips=clips), context.hits(chief), context.hits(centres)
         sphere, index = sphere_of(context, about, bent), image_index(context, wavelength)
         zero = path_to_reference_sphere(chief_hits, *sphere, index)
-        difference = (path_to_reference_sphere(hits, *sphere.at(of), index[of]) - zero[of]) / waves[of]
-        return hits.valid & (chief_hits.valid & about.valid)[of], difference
+        difference = (path_to_reference_sphere(hits, *sphere.at(rows), index[rows]) - zero[rows]) / waves[rows]
+        return hits.valid & (chief_hits.valid & about.valid)[rows], difference
 
     return opd
 
 
-def _opd_less(lines: Sequence[Line], planner: Planner, *, terms: Callable) -> Evaluate:
+def _opd_less(
+    lines: Sequence[Line], planner: Planner, *, terms: Callable[[Sequence[Line], Planner], np.ndarray]
+) -> Evaluate:
     """OPD in waves less the best fit of some terms (R, K) of rows, by the weights of the rows; K = 0: the OPD."""
     opd = opd_of(planner.rays(lines), [(line.wavelength, line.field) for line in lines], planner)
     weights = np.array([max(line.row.weight, 0.0) for line in lines])
@@ -131,7 +139,7 @@ class Fit:
         root = np.sqrt(weights)
         return np.linalg.pinv(root[:, None] * self.basis) * root
 
-    def less(self, values, valid: np.ndarray):
+    def less(self, values: Number, valid: np.ndarray) -> Number:
         """Values (R,) less their fit; valid: (R,)."""
         if not self.basis.shape[1]:
             return values
@@ -184,7 +192,7 @@ def _columns(lines: Sequence[Line], groups: list[list[int]], number: np.ndarray)
 # -- paths of single rays ----------------------------------------------------------------------------------------------
 
 
-def _between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
+def _between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]) -> Plan:
     """Optical path in mm of a ray between two surfaces.
 
     leg: both, and the wavelength; surface 0 is the object, or surface 1 for an object at infinity.
@@ -192,9 +200,7 @@ def _between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
     return lambda lines, planner: per_row(_path_of(line, *leg(line, planner), planner) for line in lines)
 
 
-def _path_of(
-    line: Line, first: int, last: int, wavelength: int, planner: Planner
-) -> Callable[[EvaluationContext], object]:
+def _path_of(line: Line, first: int, last: int, wavelength: int, planner: Planner) -> RowValue:
     """The reduced path between the surfaces, and that of the axis."""
     first, last = sorted((first, last))
     source = planner.lens.surfaces[0]
@@ -204,7 +210,7 @@ def _path_of(
     first = max(first, 1)
     start, end = (np.array([planner.ray(line, surface=s, wavelength=wavelength)]) for s in (first, max(last, 1)))
 
-    def path(context: EvaluationContext):
+    def path(context: EvaluationContext) -> Number:
         hits, behind = context.hits(start, surface=first), context.hits(end, surface=max(last, 1))
         index, gaps = context.state.index(wavelength), context.state.thickness
         length = behind.opl - hits.opl + sum(index[k] * gaps[k] for k in range(first, last))
@@ -283,17 +289,26 @@ class Beam(NamedTuple):
         return shares / shares.sum()
 
 
+#: Pupil points (2, P) and weights (P,) of a rule by its size.
+Rule: TypeAlias = Callable[[int], tuple[np.ndarray, np.ndarray]]
+
+#: The vectors of beams at a state, None of a beam without a value.
+Vectors: TypeAlias = Callable[[Sequence[Beam], Planner], Callable[[EvaluationContext], list[Number]]]
+
+
 def rings(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (2, P) and weights (P,) of Gaussian quadrature in r², four arms a ring and six at the least."""
-    return tuple(part.numpy() for part in gauss_rings(count, max(4 * count, _LEAST_ARMS)))
+    points, weights = gauss_rings(count, max(4 * count, _LEAST_ARMS))
+    return points.numpy(), weights.numpy()
 
 
 def _rectangular(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the cells of a square grid inside the pupil, `count` of them along half its side."""
-    return tuple(part.numpy() for part in square(2 * count))
+    """Points and weights of the cells of a square grid inside the pupil, `count` of them along half its side."""
+    points, weights = square(2 * count)
+    return points.numpy(), weights.numpy()
 
 
-def beam_of(line: Line, rule: Callable, clips: bool, planner: Planner) -> Beam:
+def beam_of(line: Line, rule: Rule, clips: bool, planner: Planner) -> Beam:
     """int1: the size of the rule; int2: the wavelength, 0 for all by their weights; Hx, Hy: the field."""
     if line.row.integers[0] < 1:
         raise BadRow(line, "asks for no rays: give 1 ring or more")
@@ -313,7 +328,7 @@ def colours_of(line: Line, planner: Planner) -> dict[int, float]:
     return {w: weight for w, weight in enumerate(weights) if weight > 0}
 
 
-def _rms_of(lines: Sequence[Line], planner: Planner, *, vectors: Callable, rule: Callable, clips: bool) -> Evaluate:
+def _rms_of(lines: Sequence[Line], planner: Planner, *, vectors: Vectors, rule: Rule, clips: bool) -> Evaluate:
     """The RMS of rows, each the length of the vector of its beam; vectors: None of a row without a value."""
     of_beams = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
 
@@ -334,13 +349,13 @@ def _rms_of(lines: Sequence[Line], planner: Planner, *, vectors: Callable, rule:
     return evaluate
 
 
-def _spot(*, about_chief: bool):
+def _spot(*, about_chief: bool) -> Vectors:
     """√w (x - x₀) and √w (y - y₀) mm on the image, from the centroid or the primary wavelength's chief ray."""
 
-    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list[Number]]:
         chiefs = [np.array([planner.ask(planner.primary, beam.line.field, (0.0, 0.0))]) for beam in beams]
 
-        def of(beam: Beam, chief: np.ndarray, context: EvaluationContext):
+        def of(beam: Beam, chief: np.ndarray, context: EvaluationContext) -> Number:
             hits, centre = context.hits(beam.rays, clips=beam.clips), context.hits(chief)
             weights = beam.weights(hits.valid)
             if weights is None or (about_chief and not centre.valid[0]):
@@ -356,10 +371,10 @@ def _spot(*, about_chief: bool):
     return vectors
 
 
-def _wave(*, tilted: bool):
+def _wave(*, tilted: bool) -> Vectors:
     """√w W, waves, about the mean of each colour on its own sphere; tilted: about its tilt too, the centroid's."""
 
-    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list[Number]]:
         rays = np.concatenate([beam.rays for beam in beams])
         fields = [(w, beam.line.field) for beam in beams for w in beam.colours.tolist()]
         opd = opd_of(rays, fields, planner, clips=beams[0].clips)
@@ -367,13 +382,13 @@ def _wave(*, tilted: bool):
         places = [slice(end - len(beam.rays), end) for beam, end in zip(beams, ends, strict=True)]
         fits = [Fit(_terms(beam, tilted), beam.shares) for beam in beams]
 
-        def numbers(context: EvaluationContext) -> list:
+        def numbers(context: EvaluationContext) -> list[Number]:
             valid, values = opd(context)
             return [of(*parts, valid, values) for parts in zip(beams, fits, places, strict=True)]
 
         return numbers
 
-    def of(beam: Beam, fit: Fit, place: slice, valid: np.ndarray, values):
+    def of(beam: Beam, fit: Fit, place: slice, valid: np.ndarray, values: Number) -> Number:
         weights = beam.weights(valid[place])
         return None if weights is None else np.sqrt(weights) * fit.less(values[place], valid[place])
 
@@ -398,13 +413,13 @@ _GRID = (
 )
 
 _SPOT, _WAVEFRONT = "RMS radius of a spot about", "RMS wavefront error about"
-#: By the second and the last letter: spot or wavefront, about the centroid or the chief ray.
-_VECTORS = {
-    "SE": (_spot(about_chief=False), f"{_SPOT} its centroid"),
-    "SH": (_spot(about_chief=True), f"{_SPOT} the chief ray of the primary wavelength"),
-    "WE": (_wave(tilted=True), f"{_WAVEFRONT} the centroid, waves"),
-    "WH": (_wave(tilted=False), f"{_WAVEFRONT} the chief ray, waves"),
-}
+#: The second and the last letter: spot or wavefront, about the centroid or the chief ray.
+_VECTORS = (
+    ("S", "E", _spot(about_chief=False), f"{_SPOT} its centroid"),
+    ("S", "H", _spot(about_chief=True), f"{_SPOT} the chief ray of the primary wavelength"),
+    ("W", "E", _wave(tilted=True), f"{_WAVEFRONT} the centroid, waves"),
+    ("W", "H", _wave(tilted=False), f"{_WAVEFRONT} the chief ray, waves"),
+)
 
 #: RSCE to RWRH; the third letter: C rings, R grid.
 QUALITY = {
@@ -416,5 +431,5 @@ QUALITY = {
         takes=("", "colour"),
     )
     for rule, points, clips, convention in (("C", rings, False, _RINGS), ("R", _rectangular, True, _GRID))
-    for (quantity, about), (vector, text) in _VECTORS.items()
+    for quantity, about, vector, text in _VECTORS
 }

@@ -1,9 +1,11 @@
-"""Tolerances: the rows of a lens, what is adjusted after manufacture, and the wavelength of the test."""
+"""Table of tolerances: the rows of a lens, the compensators that are adjusted after manufacture, and the wavelength of
+the test."""
 
 import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +20,8 @@ class BadTolerance(RaytraceError, ValueError):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tolerances(Result):
-    """Tolerances of a lens: `print(tolerances)` shows them, `tolerances[3]` is a row, `len(tolerances)` their number.
+class ToleranceTable(Result):
+    """The tolerances of a lens: `print(table)` shows them, `table[3]` is a row, `len(table)` their number.
 
     rows: `Tolerance`; an error of `perturbed` belongs to each, in this order.
     compensators: `Compensator`; test_wavelength: of fringes, µm.
@@ -82,7 +84,7 @@ class Tolerances(Result):
         every = torch.arange(len(self.rows))
         return limits.new_zeros(len(every), len(every)).index_put((self.leaders, every), limits)
 
-    def only(self, *kinds: str) -> "Tolerances":
+    def only(self, *kinds: str) -> "ToleranceTable":
         """The tolerances with the rows of these kinds alone."""
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.kind in kinds), saves=())
 
@@ -118,23 +120,27 @@ class Tolerances(Result):
 
     def tables(self) -> Sequence[Table]:
         title = [f"{len(self.rows)} tolerances, fringes at {self.test_wavelength:g} µm"]
-        notes = [f"compensator: {one}" for one in self.compensators]
+        notes = [f"compensator: {compensator}" for compensator in self.compensators]
         return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         """The rows and compensators as plain values."""
 
-        def plain(row) -> dict:
-            found = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
-            stated = {name: part for name, part in found.items() if part not in ("", None, ())}
+        def plain(row: Tolerance | Compensator) -> dict[str, Any]:
+            fields = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
+            stated = {name: part for name, part in fields.items() if part not in ("", None, ())}
             return {name: number(part) if isinstance(part, float) else part for name, part in stated.items()}
 
         return {
             "test_wavelength": self.test_wavelength,
             "tolerances": [plain(row) for row in self.rows],
-            "compensators": [plain(one) for one in self.compensators],
+            "compensators": [plain(compensator) for compensator in self.compensators],
             "unread": list(self.unread),
         }
+
+
+#: Former name.
+Tolerances = ToleranceTable
 
 
 def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
@@ -145,9 +151,9 @@ def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
     return list(groups.values())
 
 
-def rows_of(tolerances: Tolerances | Iterable[Tolerance]) -> tuple[Tolerance, ...]:
+def rows_of(tolerances: ToleranceTable | Iterable[Tolerance]) -> tuple[Tolerance, ...]:
     """The rows of tolerances, or of a sequence of them."""
-    return tolerances.rows if isinstance(tolerances, Tolerances) else tuple(tolerances)
+    return tolerances.rows if isinstance(tolerances, ToleranceTable) else tuple(tolerances)
 
 
 def check_limits(row: Tolerance) -> None:

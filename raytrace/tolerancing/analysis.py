@@ -1,11 +1,11 @@
-"""The lens as built: sensitivities, expectation and distribution, as a result with its table and figure."""
+"""Tolerance analysis: sensitivities, expectation and distribution of the lens as built, with table and figure."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -21,16 +21,19 @@ from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.criteria import Criterion, criterion_of
-from raytrace.tolerancing.grades import tolerances as tolerances_of_grade
+from raytrace.tolerancing.criteria import Criterion, Sampling, criterion_of
+from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable, groups_of
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.tolerancing.tolerances import BadTolerance, Tolerances, groups_of
 from raytrace.words import option
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Percentages of the table of percentiles.
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
@@ -40,7 +43,7 @@ _NEGATIVE = 0.02  # accepted share of draws whose mean square is negative by sec
 
 
 @value
-class Toleranced(Result):
+class ToleranceAnalysis(Result):
     """The lens as built.
 
     better: "smaller" or "larger", which values of the criterion are better; angle: radians of its unit, 0 for no angle.
@@ -61,7 +64,7 @@ class Toleranced(Result):
     """
 
     lens: Lens
-    tolerances: object
+    tolerances: ToleranceTable
     criterion: str
     unit: str
     nominal: Tensor
@@ -87,7 +90,7 @@ class Toleranced(Result):
     angle: float = 0.0
     goal: float | None = None
     share: float = 0.9
-    given: object = None
+    given: ToleranceTable | None = None
     better: str = "smaller"
 
     COLUMNS = property(
@@ -130,7 +133,7 @@ class Toleranced(Result):
     def labels(self) -> list[str]:
         """Kind and place of every row in words; of the first row of a group those of all its rows."""
         labels = self.tolerances.labels
-        for first, *_, last in (places for places in groups_of(self.tolerances) if len(places) > 1):
+        for first, *_, last in (places for places in groups_of(self.tolerances.rows) if len(places) > 1):
             labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
         return labels
 
@@ -156,13 +159,13 @@ class Toleranced(Result):
         if self.given is None:
             return []
         pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
-        found = [(label, _factor(new, old)) for new, old, label in pairs]
-        return sorted((pair for pair in found if pair[1] < 1), key=lambda pair: pair[1])
+        factors = [(label, _factor(new, old)) for new, old, label in pairs]
+        return sorted((pair for pair in factors if pair[1] < 1), key=lambda pair: pair[1])
 
     def at_limit(self, number: int) -> int:
         """How many trials have a compensator, by its number from 0, at one of its limits."""
-        one, moved = self.tolerances.compensators[number], self.changes[:, number]
-        return int(((moved <= one.minimum) | (moved >= one.maximum)).sum())
+        compensator, moved = self.tolerances.compensators[number], self.changes[:, number]
+        return int(((moved <= compensator.minimum) | (moved >= compensator.maximum)).sum())
 
     def trial(self, number: int) -> Lens:
         """The lens of a trial, by its number from 0: perturbed, its compensators moved; a note has its criterion.
@@ -242,39 +245,39 @@ class Toleranced(Result):
         return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
 
     def summary(self) -> dict[str, float]:
-        """Figures of the lens as built, in the unit of the criterion."""
-        found = {
+        """Numbers of the lens as built, in the unit of the criterion."""
+        summary = {
             "nominal": float(self.nominal),
             "estimated": float(self.estimated),
             "expected": float(self.expected),
         }
         if self.better == "smaller":
-            found["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
-        found["second_order_holds"] = not self.holds
+            summary["expected_root_mean_square"] = math.sqrt(float(self.expected_square))
+        summary["second_order_holds"] = not self.holds
         if len(self.trials):
             good = self.trials[~self.trials.isnan()]
             ends = (good * self.sign).aminmax() if len(good) else (torch.tensor(torch.nan),) * 2
-            found |= {"mean": float(good.mean()), "sigma": float(good.std()) if len(good) > 1 else math.nan}
-            found |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
-            found |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
-            found |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+            summary |= {"mean": float(good.mean()), "sigma": float(good.std()) if len(good) > 1 else math.nan}
+            summary |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
+            summary |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
+            summary |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
         if self.goal is not None:
             reached = self.sign * self.predicted <= self.sign * self.goal
-            found |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
+            summary |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
             if len(self.trials):
-                found["yield"] = self.yield_at(self.goal)
-        return found
+                summary["yield"] = self.yield_at(self.goal)
+        return summary
 
     def tables(self) -> list[Table]:
-        found = self.summary()
-        about = [f"{self.title}: nominal {found['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
+        summary = self.summary()
+        about = [f"{self.title}: nominal {summary['nominal']:.6g}" + (", larger is better" if self.sign < 0 else "")]
         if self.configurations > 1:
             about[0] += f", of {self.configurations} configurations together"
-        root, failing = found.get("expected_root_mean_square"), int((self.minimum + self.maximum).isnan().sum())
+        root, failing = summary.get("expected_root_mean_square"), int((self.minimum + self.maximum).isnan().sum())
         about.append(
-            f"as built, expected by second order: mean {found['expected']:.6g}"
+            f"as built, expected by second order: mean {summary['expected']:.6g}"
             + (f", root mean square {root:.6g}" if root is not None else "")
-            + f"; estimated by RSS {found['estimated']:.6g}"
+            + f"; estimated by RSS {summary['estimated']:.6g}"
         )
         if self.holds:
             about.append(f"the second order does not hold: {self.holds}; rely on the trials")
@@ -283,36 +286,36 @@ class Toleranced(Result):
                 f"{failing} tolerances lose more than {100 * self.light_loss:g} % of the light at a limit: not in RSS"
             )
         if self.angle:
-            numbers = {"expected": found["expected"], "estimated by RSS": found["estimated"]}
-            numbers |= {"90 % within": found["percent_90"]} if len(self.trials) else {}
+            numbers = {"expected": summary["expected"], "estimated by RSS": summary["estimated"]}
+            numbers |= {"90 % within": summary["percent_90"]} if len(self.trials) else {}
             listed = ", ".join(f"{word} {1e3 * self.angle * number:.4g}" for word, number in numbers.items())
             about.append(f"as an angle, divided by the focal length, mrad: {listed}")
         if not self.tolerances.compensators:
             about.append("no compensator")
         if len(self.trials):
             about.append(
-                f"{len(self.trials):,} trials (seed {self.seed}): mean {found['mean']:.6g}, σ {found['sigma']:.4g}, "
-                f"best {found['best']:.6g}, worst {found['worst']:.6g}"
+                f"{len(self.trials):,} trials (seed {self.seed}): mean {summary['mean']:.6g}, "
+                f"σ {summary['sigma']:.4g}, best {summary['best']:.6g}, worst {summary['worst']:.6g}"
             )
-            if found["lost_light"] > 0:
+            if summary["lost_light"] > 0:
                 about.append(
-                    f"light lost in {int((self.lost > 0).sum())} trials, {100 * found['lost_light']:.3g} % at most; "
-                    f"{found['failed']} failed, by more than {100 * self.light_loss:g} %, and count as the worst"
+                    f"light lost in {int((self.lost > 0).sum())} trials, {100 * summary['lost_light']:.3g} % at most; "
+                    f"{summary['failed']} failed, by more than {100 * self.light_loss:g} %, and count as the worst"
                 )
             good = ~self.trials.isnan()
-            for k, one in enumerate(self.tolerances.compensators):
+            for k, compensator in enumerate(self.tolerances.compensators):
                 c = self.changes[good, k]
                 if not bool(c.any()):
-                    about.append(f"compensator {one}: it stays{', as it has no effect' * bool(len(c))}")
+                    about.append(f"compensator {compensator}: it stays{', as it has no effect' * bool(len(c))}")
                     continue
                 about.append(
-                    f"compensator {one}: {float(c.min()):.4g} to {float(c.max()):.4g}, mean {float(c.mean()):.4g}, "
-                    f"σ {float(c.std()):.4g}"
+                    f"compensator {compensator}: {float(c.min()):.4g} to {float(c.max()):.4g}, "
+                    f"mean {float(c.mean()):.4g}, σ {float(c.std()):.4g}"
                     + (f"; at a limit in {at_limit}" if (at_limit := self.at_limit(k)) else "")
                 )
         if self.goal is not None:
-            traced = f", {100 * found['yield']:.4g} % of the trials" if len(self.trials) else ""
-            share = f"{100 * found['yield_by_second_order']:.4g} % by second order"
+            traced = f", {100 * summary['yield']:.4g} % of the trials" if len(self.trials) else ""
+            share = f"{100 * summary['yield_by_second_order']:.4g} % by second order"
             bound = "at most" if self.sign > 0 else "at least"
             about.append(f"{bound} {self.goal:g}{' ' * bool(self.unit)}{self.unit}: {share}{traced}")
         if self.given is not None:
@@ -323,20 +326,20 @@ class Toleranced(Result):
             )
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
-        found = [Table(self.columns(), about, self.tolerances.notes)]
+        tables = [Table(self.columns(), about, self.tolerances.notes)]
         if len(self.trials):
             bound = "within" if self.sign > 0 else "above"
-            found.append(
+            tables.append(
                 Table(self.table_of_shares(), [f"share of the trials {bound} a limit, and the same by second order"])
             )
-        return found
+        return tables
 
-    def document(self) -> dict:
+    def document(self) -> dict[str, Any]:
         about = {"criterion": self.criterion, "unit": self.unit, **self.summary(), **Result.document(self)}
         return about | ({"unread": list(self.tolerances.unread)} if self.tolerances.unread else {})
 
     @styled
-    def draw(self):
+    def draw(self, **options: Any) -> "Figure":
         """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
         figure = new_figure(9.0, 4.2)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
@@ -370,14 +373,14 @@ class Toleranced(Result):
 
 
 def _factor(new: Tolerance, old: Tolerance) -> float:
-    """How much narrower the limits of a row are."""
+    """The ratio of the new to the old range of a row."""
     wide = old.maximum - old.minimum
     return (new.maximum - new.minimum) / wide if wide else 1.0
 
 
-def tolerance(
+def tolerance_analysis(
     lens: Lens,
-    tolerances: Tolerances | None = None,
+    tolerances: ToleranceTable | None = None,
     *,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
@@ -398,16 +401,16 @@ def tolerance(
     checkpoint: str | PathLike | None = None,
     share: Share | None = None,
     progress: Callable | None = None,
-) -> Toleranced:
+) -> ToleranceAnalysis:
     """The lens as built: sensitivities, expectation by second order and Monte Carlo.
 
-    A lens of several configurations is judged in all of them, by the mean of what the compensators minimise, by the
-    weights that its file gives them (CWGT), alike without.
-    `lens.configuration(2)` of a lens read alone: leave its others out by `operands=()`.
+    A lens of several configurations is judged in all of them: the compensators minimise the mean over the
+    configurations by the weights of the file (CWGT), equal by default. For `lens.configuration(2)` alone, remove the
+    others by `operands=()`.
 
-    tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of `grade`
-        and `limits`.
-    grade: tolerances of published grades instead of the file's, see `tolerances`.
+    tolerances: as `tolerance_table` or `read_tolerances` return them; by default those of the lens's own file, or of
+        `grade` and `limits`.
+    grade: tolerances of published grades instead of the file's, see `tolerance_table`.
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
@@ -420,7 +423,7 @@ def tolerance(
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
-    goal: what the criterion of a good lens is at most, the MTF at least; the share of such lenses is reported.
+    goal: largest criterion of a good lens, of the MTF the smallest; the share of good lenses is reported.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
         least total tightness until this share reaches the goal, by second order corrected by traced lenses.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
@@ -433,7 +436,7 @@ def tolerance(
     model: of "psf", by default gaussian, which is smooth in the errors; pixel, size: of its windows, pitch in mm,
         0.005 by default, and number of pixels across, 21 by default.
     merit: of "merit", as `optimize` takes it; by default that of the file.
-    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study goes on.
+    checkpoint: a file (.jsonl) of finished trials, from which an interrupted study resumes.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
@@ -441,7 +444,7 @@ def tolerance(
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
-        tolerances = tolerances_of_grade(lens, limits, grade=grade)
+        tolerances = tolerance_table(lens, limits, grade=grade)
     elif grade or limits:
         raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if not len(tolerances):
@@ -451,8 +454,11 @@ def tolerance(
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= light_loss <= 1:
         raise ValueError(f"light_loss {light_loss:g}: expected a share of the light between 0 and 1, as 0.05")
-    options = {"model": model, "pixel": pixel, "size": size, "merit": merit}
-    views = views_of(lens, lambda *each: criterion_of(criterion, *each, **options), fields, rings, arms)
+
+    def criterion_near(view: Lens, sampling: Sampling) -> Criterion:
+        return criterion_of(criterion, view, sampling, model=model, pixel=pixel, size=size, merit=merit)
+
+    views = views_of(lens, criterion_near, fields, rings, arms)
     chosen, study, given = views[0].criterion, Study(views, tolerances, light_loss), tolerances
     if study.compensators:
         study.nominal_curvature()  # refuses those without effect
@@ -485,7 +491,7 @@ def tolerance(
     low, high = (chosen.sign * changes).chunk(2)
     light_low, light_high = (1 - light).chunk(2)
     rss = (0.5 * (low**2 + high**2)).nansum().sqrt()
-    return Toleranced(
+    return ToleranceAnalysis(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal, minimum=low,
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
         slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
@@ -495,6 +501,10 @@ def tolerance(
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
+
+
+#: Former names.
+Toleranced, tolerance = ToleranceAnalysis, tolerance_analysis
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:

@@ -1,0 +1,151 @@
+"""Attained values: every condition and boundary of an optimisation with its target and the value that the lens has."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from raytrace.optimization.merit import Evaluated, arguments
+from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.problem import RELATIONS, Condition, Problem
+from raytrace.words import RaytraceWarning
+
+EXACT = 1e-6  # tolerance of a condition, relative to its target, or to 1
+SOFT = 1e-3  # tolerance of a boundary in the merit function, relative to its target, or 1 µm
+
+
+class NotReached(RaytraceWarning):
+    """A condition or a boundary that the optimised lens does not meet."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Attained:
+    """The target and the attained value of a condition or boundary.
+
+    name: of the condition, or of the operand and its arguments; relation: =, <= or >=; asked, reached: the target and
+    the value, in mm of conditions, in the unit of the row of rows; row: in the merit function, from 1; 0 of `hold`;
+    configuration: 0 for a lens with a single configuration; surface: the one with the largest excess over a boundary,
+    0 for none; why: the reason.
+    """
+
+    name: str
+    relation: str
+    asked: float
+    reached: float
+    met: bool
+    row: int = 0
+    configuration: int = 0
+    surface: int = 0
+    why: str = ""
+
+    @property
+    def words(self) -> str:
+        """The condition, as "efl=100"."""
+        if self.row:
+            return f"{self.name} {self.relation} {self.asked:.6g} (row {self.row})"
+        return f"{self.name}{self.relation}{self.asked:.6g}"
+
+    @property
+    def place(self) -> str:
+        """Surface and configuration in words."""
+        parts = {"surface": self.surface, "configuration": self.configuration}
+        return ", ".join(f"{name} {number}" for name, number in parts.items() if number)
+
+    def document(self) -> dict[str, object]:
+        return {**dataclasses.asdict(self), "reached": self.reached if np.isfinite(self.reached) else None}
+
+    def __str__(self) -> str:
+        where = f" ({self.place})" if self.place else ""
+        reached = f"{self.reached:.6g}" if np.isfinite(self.reached) else "undefined"
+        return f"{self.words} is not reached: {reached}{where}{f'; {self.why}' if self.why else ''}"
+
+
+def attained(problem: Problem, evaluated: Evaluated) -> tuple[Attained, ...]:
+    """Every condition, then every boundary of the merit function, without reasons."""
+    return *conditions_attained(problem, evaluated), *_boundaries(problem, evaluated)
+
+
+def rows_attained(problem: Problem) -> list[int]:
+    """The rows, from 0, of the results of `attained`."""
+    return [*condition_rows(problem), *_bounding_rows(problem)]
+
+
+def condition_rows(problem: Problem) -> list[int]:
+    """The rows of the conditions, from 0, among all rows of the evaluation."""
+    rows = problem.evaluation.rows
+    return [k for k in range(len(problem.rows), len(rows)) if rows[k].weight < 0]
+
+
+def _bounding_rows(problem: Problem) -> list[int]:
+    """Rows of the merit function, from 0, that must be met: rows with a weight below 0, and boundaries."""
+    weights = problem.evaluation.weights
+    return [
+        k
+        for k, row in enumerate(problem.rows)
+        if weights[k] and (weights[k] < 0 or (row.operand in OPERANDS and OPERANDS[row.operand].bounds))
+    ]
+
+
+def conditions_attained(problem: Problem, evaluated: Evaluated) -> Iterator[Attained]:
+    """Every condition, without reasons."""
+    model, excesses = problem.model, _largest_excesses(evaluated)
+    for k, condition in zip(condition_rows(problem), problem.conditions, strict=True):
+        unit = problem.unit ** OPERANDS[condition.row.operand].length
+        number, surface = _number_of(problem, k, evaluated, excesses)
+        relation, target, number = condition.relation, unit * problem.evaluation.rows[k].target, unit * number
+        missed = abs(number - target) if relation == "=" else RELATIONS[relation] * (number - target)
+        met = bool(missed <= EXACT * max(abs(target), 1.0))
+        configuration = (condition.configuration or model.lens.current_configuration) if len(model.views) > 1 else 0
+        surface = 0 if met else surface
+        yield Attained(name_of_condition(condition), relation, target, number, met, 0, configuration, surface)
+
+
+def name_of_condition(condition: Condition) -> str:
+    """The name of a condition in the syntax of `hold`, as "efl@2"."""
+    configuration = f"@{condition.configuration}" if condition.configuration else ""
+    return f"{condition.name or condition.row.name}{configuration}"
+
+
+def _largest_excesses(evaluated: Evaluated) -> dict[int, tuple[float, int]]:
+    """The largest excess of every one-sided row, also below 0, and its surface."""
+    largest: dict[int, tuple[float, int]] = {}
+    for rows, excesses, _, surfaces in evaluated.sides:
+        for row, excess, surface in zip(rows.tolist(), excesses.tolist(), surfaces.tolist(), strict=True):
+            if row not in largest or excess > largest[row][0]:
+                largest[row] = excess, surface
+    return largest
+
+
+def _number_of(
+    problem: Problem, k: int, evaluated: Evaluated, excesses: dict[int, tuple[float, int]]
+) -> tuple[float, int]:
+    """The quantity of a row, which a one-sided operand reports as its target where it is met, and its surface."""
+    row, number = problem.evaluation.rows[k], float(evaluated.values[k])
+    operand = OPERANDS[row.operand]
+    if k in excesses:
+        excess, surface = excesses[k]
+        side = -1.0 if operand.bounds == ">=" else 1.0
+        return row.target + side * excess / problem.evaluation.factors[k], surface
+    if operand.bounds and operand.refers:
+        number = float(evaluated.values[row.integers[0] - 1])
+        number = abs(number) if row.name.startswith("AB") else number
+    return number, 0
+
+
+def _boundaries(problem: Problem, evaluated: Evaluated) -> Iterator[Attained]:
+    evaluation, excesses = problem.evaluation, _largest_excesses(evaluated)
+    configurations = {
+        line.number - 1: planner.view.configuration for planner, lines, _ in evaluation.groups for line in lines
+    }
+    several = len(problem.model.views) > 1
+    for k in _bounding_rows(problem):
+        row, operand = problem.rows[k], OPERANDS[problem.rows[k].operand]
+        relation = operand.bounds or "="
+        number, surface = _number_of(problem, k, evaluated, excesses)
+        surface = surface if k in excesses and excesses[k][0] > 0 else 0
+        missed = abs(number - row.target) if relation == "=" else RELATIONS[relation] * (number - row.target)
+        tolerance = EXACT if evaluation.weights[k] < 0 else SOFT
+        least = 1e-3 / problem.unit if tolerance == SOFT and operand.length == 1 else tolerance
+        met = bool(missed <= max(tolerance * abs(row.target), least))
+        name = f"{row.name} {arguments(row)}".strip()
+        yield Attained(name, relation, row.target, number, met, k + 1, configurations[k] if several else 0, surface)
