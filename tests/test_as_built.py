@@ -157,7 +157,7 @@ def test_optimize_lowers_the_expectation(cooke):
     assert change.nominal[1] < change.expected[1] < change.expected[0]
     assert robust.merit_after < robust.merit_before
     assert abs(robust.merit_after / float(robust.history[-1, 0]) - 1) < 1e-12
-    assert "as built (6 tolerances, of `limits`, weight 20): expected" in str(robust)
+    assert "as built (6 tolerances, of limits, weight 20): expected" in str(robust)
     assert robust.document()["as_built"]["expected"] == list(change.expected)
     assert usual.as_built is None
 
@@ -216,7 +216,7 @@ def test_search_orders_minima_by_the_merit_as_built(cooke):
         assert abs(float(expected[k]) / end.as_built.expected[0] - 1) < 1e-12
         assert abs(float(nominal[k]) / end.as_built.nominal[0] - 1) < 1e-12
     assert "merit_as_built" in ranked.columns()
-    assert "in the order of the merit as built: of `limits`, weight 5" in str(ranked)
+    assert "in the order of the merit as built: of limits, weight 5" in str(ranked)
     assert usual.as_built is None
     with pytest.raises(rt.BadTolerance, match="no tolerances of its own"):
         rt.search(lens, as_built=rt.AsBuilt(), **settings)

@@ -18,10 +18,8 @@ import torch
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.cli.commands import COMMANDS
-from raytrace.cli.run import RUNNER_OPTIONS
-from raytrace.io.pictures import read_depth
+from raytrace.cli.options import add
 from raytrace.maths.result import Result
-from raytrace.optimization.merit import DefaultMerit, Merit, merit_of_options
 from raytrace.system.lens import field_points
 from raytrace.tracing.launch import launch
 from raytrace.tracing.spot import spot_of
@@ -322,29 +320,8 @@ OF_A_LENS = [c for c in VERBS if c.run is None and c.name not in ("evaluate", "o
 
 def options_of(command) -> set[str]:
     parser = argparse.ArgumentParser(add_help=False)
-    command.add_arguments(parser)
+    add(parser, command.options)
     return {action.dest for action in parser._actions}
-
-
-@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
-def test_a_command_has_the_options_of_its_function(command):
-    verb = rt.public_name(command.verb)
-    keywords = inspect.signature(verb).parameters
-    own = {name for name in options_of(command) if not name.startswith("plot_")} - {*RUNNER_OPTIONS}
-    if command.verb == "psf":  # in the objects of a model and of the execution
-        own -= {"rays", "rho"}
-    if "merit" in keywords:
-        for definition in (merit_of_options, DefaultMerit, Merit.of):
-            own -= {*inspect.signature(definition).parameters}
-    if "sensor" in keywords:
-        for definition in (rt.Sensor, rt.Sensor.capture, read_depth):
-            own -= {*inspect.signature(definition).parameters}
-    if "as_built" in keywords:
-        own -= {*inspect.signature(rt.AsBuilt).parameters}
-    if command.verb == "render":  # how the file is written
-        own -= {"png_bits", "raw"}
-    assert own <= {*keywords}
-    assert verb.__doc__
 
 
 def assert_alike(one, other) -> None:

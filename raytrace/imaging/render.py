@@ -531,7 +531,7 @@ def _afford_kernels(nodes: tuple[int, int], count: int, weights: Tensor, size: i
     (m, n), channels = nodes, len(weights)
     (columns, rows), each = sensor.pixels, _COPIES * weights.element_size()
     what = f"kernels of {size} × {size} pixels at {m} × {n} places of the sensor need too much memory"
-    helps = "take a larger --tol or a smaller --sensor, or focus the lens (--size sets their window)"
+    helps = "take a larger {tol} or a smaller {sensor}, or focus the lens ({size} sets their window)"
     afford(each * channels * count * m * n * size * size, what, helps=helps)
     what = f"{columns} × {rows} pixels of {channels} channels need too much memory"
     afford(each * channels * columns * rows, what, helps="take a picture of fewer pixels")

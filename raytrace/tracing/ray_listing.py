@@ -26,7 +26,7 @@ from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import STATUS, LostRays
 from raytrace.tracing.trace import axial_path, sequence_of, steps, trace_lens
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, option
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))
 _LOST = {_MISS: "missed", _TIR: "were totally reflected at", _VIGNETTED: "were vignetted at"}
@@ -184,7 +184,8 @@ def trace(
         launched, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
-            message = "`object_distances` and `fields` change nothing: a table defines where its rays start"
+            placed = f"{option('object_distances')} and {option('fields')}"
+            message = f"{placed} change nothing: a table defines where its rays start"
             warnings.warn(message, ChangesNothing, stacklevel=calling_level())
         launched = rays if isinstance(rays, Rays) else read_rays(rays, lens)
     wavelength = launched.wavelength
