@@ -23,7 +23,6 @@ FLOORS = {
     # how figures look; a figure is drawn by its result
     "plotting": 0,
     "maths": 1,
-    "pages": 1,
     "stores": 1,
     "settings": 1,
     # data and physics
@@ -40,8 +39,6 @@ FLOORS = {
     "tolerancing": 9,
     "imaging": 10,
     "viewer": 11,
-    # pages of experiments
-    "experiments": 12,
     "cli": 13,
     # measurements: nothing imports them
     "bench": 14,
@@ -65,10 +62,9 @@ DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "u
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
-    "matplotlib": (r"bench\.figures",),
+    "matplotlib": (r"bench\.result",),
     "pandas": (r"io\.frames", r"cli"),
     "tqdm": (r"cli", r"bench"),
-    "optiland": (r"bench\.peers",),
 }
 
 
@@ -235,11 +231,11 @@ DISTRIBUTIONS = {"PIL": "pillow", "colour": "colour-science", "mpl_toolkits": "m
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed; viewer and measured cameras have extras."""
+    """Viewer and measured cameras have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [name for extra in ("view", "colour") for name in project["optional-dependencies"][extra]]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
-    library = (path for name, path in MODULES.items() if package_of(name) != "bench")
+    library = MODULES.values()
     roots = {name.split(".")[0] for path in library for name in imports(path)}
     others = roots - set(sys.stdlib_module_names) - {package_of(name) for name in MODULES} - {"raytrace"}
     assert {DISTRIBUTIONS.get(name, name) for name in others} <= declared
