@@ -250,7 +250,7 @@ def test_wrong_cameras_as_built_are_refused(lens):
     built = rt.Camera(variables, rt.RedNet(), tolerances=tolerances)
     with pytest.raises(rt.BadTolerance, match=r"expected \(79,\), an error for each row"):
         built.kernels(DISTANCES, 0, errors[:, :5])
-    with pytest.raises(ValueError, match="2 object_distances for a batch of 3 lenses"):
+    with pytest.raises(ValueError, match=r"2 object_distances .* 3 lenses"):
         built.kernels(DISTANCES[:2], 0, errors)
     with pytest.raises(ValueError, match="refocus 'gap': expected sensor or none"):
         camera(lens, dataclasses.replace(BUILT, refocus="gap"))

@@ -191,7 +191,7 @@ def test_catalogs_are_searched_in_the_order_of_the_lens_file():
 
 
 def test_a_name_of_two_glasses_is_reported_unless_the_lens_file_decides():
-    with pytest.warns(AmbiguousGlass, match=r"lens\.csv:3: SK2 is taken from SCHOTT.*HIKARI by 3\.\de-05"):
+    with pytest.warns(AmbiguousGlass, match=r"lens\.csv:3: SK2 .*SCHOTT.*HIKARI by 3\.\de-05"):
         assert find_glass("SK2", where="lens.csv:3").catalog == "SCHOTT"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -406,7 +406,7 @@ def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
 def test_binary_and_damaged_files(tmp_path):
     path = tmp_path / "bad.agf"
     path.write_bytes(b"NM A\nPK\x03\x04" + bytes(range(256)) * 9)
-    with pytest.raises(CatalogError, match=r"bad\.agf:2: found binary data \(byte 0x03\)"):
+    with pytest.raises(CatalogError, match=r"bad\.agf:2: .*byte 0x03"):
         read_agf(path)
     path.write_bytes(SMALL.encode("utf-16")[:501])
     with pytest.raises(CatalogError, match=r"damaged UTF-16 text.*cut off"):
@@ -424,10 +424,10 @@ def test_a_file_too_large_is_refused_before_it_is_read(tmp_path):
 def test_ignored_data_are_reported(tmp_path):
     path = tmp_path / "odd.agf"
     path.write_text(SMALL + "QX 1 2 3\n")
-    with pytest.warns(CatalogWarning, match=r"odd\.agf: left aside lines that begin with 'QX' \(line 17\)"):
+    with pytest.warns(CatalogWarning, match=r"odd\.agf: .*'QX' \(line 17\)"):
         assert len(read_agf(path).glasses) == 2
     path.write_text(SMALL.replace("NM Two", "NM ONE"))
-    with pytest.warns(CatalogWarning, match=r"odd\.agf:14: ONE is defined again; the first"):
+    with pytest.warns(CatalogWarning, match=r"odd\.agf:14: ONE .*again; the first"):
         assert read_agf(path).glasses["ONE"].nd_listed == 1.5168
 
 
@@ -527,7 +527,7 @@ def test_what_has_no_nd_and_vd_has_no_nearest_glass():
         nearest_glasses(constant(1.5))
     with pytest.raises(ValueError, match="a mirror has no refractive index"):
         nearest_glasses(MIRROR)
-    with pytest.raises(CatalogError, match="no catalog 'OHARRA' is shipped; there are SCHOTT, OHARA"):
+    with pytest.raises(CatalogError, match=r"'OHARRA' .*SCHOTT, OHARA"):
         nearest_glasses("N-BK7", catalogs=["OHARRA"])
 
 

@@ -222,7 +222,7 @@ def test_configurations_are_made_from_plain_numbers(tmp_path):
 
 def test_a_configuration_that_is_not_there_is_refused():
     lens = read(file(tail=two("THIC", 1, "4", "5")))[0]
-    with pytest.raises(ValueError, match=r"configuration 3: this lens has configurations 1 to 2"):
+    with pytest.raises(ValueError, match=r"configuration 3: .*configurations 1 to 2"):
         lens.configuration(3)
     assert read(file())[0].configurations[0].current_configuration == 1
     with pytest.raises(ValueError, match="has one configuration"):
@@ -332,7 +332,7 @@ def test_terms_of_another_radius_are_followed_and_not_written(tmp_path):
     surface = "TYPE XASPHERE\nXDAT 1 1\nXDAT 2 10\nXDAT 3 0.1"
     lens = read(file(tail=two("EDVA", 1, "10", "5", 2), surface=surface))[0]
     assert [one.surfaces[1].coefficients.tolist() for one in lens.configurations] == [[0.1 / 10**2], [0.1 / 5**2]]
-    with pytest.raises(LensFileError, match="EDVA 1 2: terms of another number or radius"):
+    with pytest.raises(LensFileError, match=r"EDVA 1 2: .*number or radius"):
         write_lens(lens, tmp_path / "lens.zmx")
 
 

@@ -234,9 +234,9 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
 
 def test_an_unknown_name_lists_the_shipped_lenses():
     for name in ("double_gaus", "double_gaus.zmx"):
-        with pytest.raises(LensFileError, match=r"lenses are .*cooke_triplet.*; did you mean double_gauss\?"):
+        with pytest.raises(LensFileError, match=r"cooke_triplet.*did you mean double_gauss"):
             read_lens(name)
-    with pytest.raises(LensFileError, match="no such file or shipped lens; the shipped lenses are"):
+    with pytest.raises(LensFileError, match=r"no such file .*the shipped lenses are"):
         read_lens("biotar")
 
 

@@ -213,7 +213,7 @@ def test_a_lost_marginal_ray_leaves_the_others_aimed():
 
 
 def test_an_unknown_kind_of_aiming_is_refused():
-    with pytest.raises(ValueError, match="ray aiming 'on': expected one of auto, off, paraxial, real"):
+    with pytest.raises(ValueError, match=r"'on': expected .*auto, off, paraxial, real"):
         launch(double_gauss(), CENTRE, ray_aiming="on")
 
 

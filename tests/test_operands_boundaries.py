@@ -423,9 +423,7 @@ def test_other_readings_take_the_largest_lack_and_signed_thicknesses():
 
 
 def test_a_surface_that_is_not_there_is_named():
-    with pytest.raises(
-        ValueError, match=r"row 1 of the merit function: CTGT .* surface 9: this lens has surfaces 0 to 3"
-    ):
+    with pytest.raises(ValueError, match=r"row 1 .*CTGT .* surface 9: .*surfaces 0 to 3"):
         Evaluation(DesignVariables(plate(3.0)), [Row("CTGT", (9, 0), target=4.0, weight=1.0)])
 
 

@@ -214,7 +214,7 @@ def test_the_sign_of_a_longer_path():
 
 
 def test_a_reading_that_is_not_known_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': expected one of per wavelength, common"):
+    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': .*per wavelength, common"):
         Conventions(opd_tilt="mine")
 
 
@@ -275,7 +275,7 @@ def test_paths_in_inches():
 def test_a_surface_that_is_not_there_is_named():
     lens = rt.read_lens("cooke_triplet")
     last = len(lens.surfaces) - 1
-    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH names surface 40: this lens has surfaces 0 to {last}"):
+    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH .*surface 40: .*surfaces 0 to {last}"):
         values(lens, [Row("OPTH", (40, 1))])
 
 

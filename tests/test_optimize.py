@@ -344,7 +344,7 @@ def test_errors_of_optimize_are_one_line(words, said, command_line):
 
 
 def test_a_merit_without_weight_and_one_without_light_are_refused(triplet):
-    with pytest.raises(NoProblem, match="no row of the merit function has a weight"):
+    with pytest.raises(NoProblem, match=r"no row .* has a weight"):
         rt.optimize(triplet, merit=[Row("EFFL")], vary="curvature")
     row = Row("TRAC", (0, 1), (0.0, 0.0, 0.0, 40.0), weight=1.0)
     with pytest.raises(NoProblem, match="no ray"):
@@ -439,7 +439,7 @@ def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_opti
 def test_a_row_without_a_derivative_is_refused_with_its_name(triplet):
     """0 · ∞, where a root begins."""
     bad = Row(rt.Measure("bad", lambda lens: 1 + (0 * lens.surfaces[1].curvature).abs().sqrt()), weight=1.0)
-    with pytest.raises(NoProblem, match="row 1 of the merit function, bad, has no derivative by curvature_1"):
+    with pytest.raises(NoProblem, match=r"row 1 .*bad, .*derivative by curvature_1"):
         rt.optimize(triplet, merit=[bad], vary="curvature:1", cycles=1)
 
 

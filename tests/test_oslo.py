@@ -652,10 +652,10 @@ def test_a_binary_file_is_named_as_one_of_code_v(tmp_path):
     """CODE V saves lenses under the same suffix; a damaged text is none."""
     path = tmp_path / "lens.len"
     path.write_bytes(b"CODEV\0\0\1" + bytes(range(256)) * 8)
-    with pytest.raises(LensFileError, match=r"lens\.len: is binary: a \.len file of CODE V.*sequence file \(\.seq\)"):
+    with pytest.raises(LensFileError, match=r"lens\.len: is binary: .*CODE V.*\.seq"):
         read_lens(path)
     path.write_text("RDM;LEN\nSO 0 1e13\nS 50 4 NBK7\nSI 0 0\n")
-    with pytest.raises(LensFileError, match=r"the commands are those of CODE V: rename the file to \.seq"):
+    with pytest.raises(LensFileError, match=r"CODE V: rename the file to \.seq"):
         read_lens(path)
     path.write_bytes(text(SINGLET).encode() + b"\x07\n")
     with pytest.raises(LensFileError, match=r"holds the character U\+0007"):

@@ -522,7 +522,7 @@ def computed(monkeypatch):
 
 
 def test_a_sensor_far_beyond_the_fields_is_reported_before_the_kernels(triplet, computed):
-    reported = pytest.warns(BeyondFields, match=r"43.3 mm from the axis, 2 times .* take a smaller sensor")
+    reported = pytest.warns(BeyondFields, match=r"43.3 mm .* 2 times .*smaller sensor")
     with reported, computed:
         optics(triplet, rt.Sensor(size=(72, 48), pixels=(240, 160), response="rgb"))
 
@@ -632,7 +632,7 @@ def test_a_lens_of_one_wavelength_has_no_colours(triplet):
 
 
 def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
-    with within(1e8), pytest.raises(OverBudget, match=r"kernels of 399 × 399 pixels at 3 × 3 places.*--tol.*--size"):
+    with within(1e8), pytest.raises(OverBudget, match=r"399 × 399 pixels .*3 × 3.*--tol.*--size"):
         optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
 
 

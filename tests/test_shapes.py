@@ -204,7 +204,7 @@ def test_units_and_too_many_terms(tmp_path):
     face = read_lens(path).surfaces[1]
     assert face.kind == ODD
     assert_close(face.coefficients, vector(0.1, 0.0, 0.2 / 25.4**2), rtol=1e-15, atol=0)
-    with pytest.raises(LensFileError, match=r"9 terms \(to r\^9\), an ODDASPHE has 8 \(r to r\^8\)"):
+    with pytest.raises(LensFileError, match=r"9 terms .*ODDASPHE has 8"):
         write_lens(lens([odd([1e-9] * 9), surface(None, 2.0)]), tmp_path / "odd.zmx")
 
 
@@ -344,7 +344,7 @@ class TestWhatHasToKnow:
             assert torch.equal(sag_at(found, x, x), sag_at(face, x, x))
         with pytest.raises(
             ValueError,
-            match="surface 1: kind 'cone'; expected one of even asphere, odd asphere, toroidal, biconic, dome",
+            match=r"surface 1: .*'cone'; expected .*even asphere, .*biconic, dome",
         ):
             plain.replace(1, kind="cone")
 
@@ -465,7 +465,7 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
     """A diamond |x|/a + |y|/b ≤ 1: traced, drawn, in kernels and in files; refused where it is unknown."""
     diamond = Aperture("diamond", (4.0, 3.0))
     system = lens([surface(0.02, 5.0, 1.5, apertures=(diamond,), semi_diameter=9.0), surface(-0.02, 60.0)])
-    with pytest.raises(ValueError, match="surface 1: an aperture of shape 'diamond'; expected one of circular, rect"):
+    with pytest.raises(ValueError, match=r"surface 1: .*'diamond'; expected .*circular, rect"):
         system.at(object_distance=1e4)
     row = Shape(
         lambda x, y, sizes: [Edge(x.abs() / sizes[0] + y.abs() / sizes[1], 1.0)],
@@ -489,5 +489,5 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
         write_lens(system, tmp_path / f"diamond{suffix}")
         (back,) = read_lens(tmp_path / f"diamond{suffix}").surfaces[1].apertures
         assert (back.shape, back.extent, back.obscures) == ("diamond", (4.0, 3.0), False)
-    with pytest.raises(ValueError, match=r"surface 1: an aperture \(diamond\) has a negative size"):
+    with pytest.raises(ValueError, match=r"surface 1: .*diamond.*negative size"):
         system.replace(1, apertures=(Aperture("diamond", (4.0, -3.0)),))

@@ -180,7 +180,7 @@ def test_a_table_without_its_index_is_no_lens_in_air():
         read(summilux("No,R,d", "No R d"))
     with pytest.raises(LensFileError, match=r"abbe d is 45\.2, but no index is given"):
         read(summilux("No,R,d,νd", "No R d V"))
-    with pytest.raises(LensFileError, match=r"the medium is 'air', but its figures are 1\.5168"):
+    with pytest.raises(LensFileError, match=r"'air', .* 1\.5168"):
         read("No,R,d,glass,nd\n1,50,3,air,1.5168\nstop,,40,,\nimage,,,,\n")
 
 
@@ -270,7 +270,7 @@ def test_numbers_as_people_write_them():
         1.516
     ]
     assert radius_of('"1,234.5"', separator=",") == pytest.approx(1234.5)
-    with pytest.raises(LensFileError, match=r"radius is '1,234': a decimal comma or thousands\? Write 1\.234 or 1234"):
+    with pytest.raises(LensFileError, match=r"'1,234': .*Write 1\.234 or 1234"):
         radius_of("1,234", index="2")
     with pytest.raises(LensFileError, match="a decimal comma or thousands"):
         radius_of("1,234", "-40,5")

@@ -96,12 +96,12 @@ def test_a_killed_process_leaves_a_run_that_resumes(tmp_path):
 
 def test_other_settings_are_refused(tmp_path):
     fit(tmp_path, 3)
-    with pytest.raises(OtherSettings, match=r"rate was 0\.01, now 0\.1; choose another folder"):
+    with pytest.raises(OtherSettings, match=r"rate was 0\.01, now 0\.1; .*another folder"):
         Run(tmp_path, {"rate": 0.1})
 
 
 def test_a_loss_that_is_no_number_stops_the_run_before_the_step(tmp_path):
-    with pytest.raises(NotFinite, match=r"step 7: the loss is nan.*the last checkpoint is .*checkpoint\.pt"):
+    with pytest.raises(NotFinite, match=r"step 7: .*nan.*checkpoint\.pt"):
         fit(tmp_path, 20, poison=7)
     state = Run(tmp_path, {"rate": 1e-2}).load()
     assert state["step"] == 5

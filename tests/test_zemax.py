@@ -230,7 +230,7 @@ def test_ray_aiming_is_the_second_number_of_raim(number, kind, tmp_path):
 
 
 def test_ray_aiming_of_another_kind_is_refused():
-    with pytest.raises(LensFileError, match=r"RAIM of kind 3, expected 0 \(off\), 1 \(paraxial\) or 2 \(real\)"):
+    with pytest.raises(LensFileError, match=r"RAIM .*3, expected 0 .*, 1 .* or 2"):
         lens(PWAV="PWAV 1\nRAIM 0 3 1 1")
 
 
@@ -353,7 +353,7 @@ def test_report_sorts_every_keyword():
     assert "unknown" in str(report)
     assert "surface 1: N-BK7, SCHOTT" in str(report)
     assert json.loads(json.dumps(report.document()))["keywords"][0]["count"] == 1
-    with pytest.raises(LensFileError, match=r"unknown keyword .* \(and 1 more warning\)"):
+    with pytest.raises(LensFileError, match=r"unknown keyword .*1 more"):
         read(text, strict=True)
 
 

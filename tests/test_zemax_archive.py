@@ -167,13 +167,13 @@ def test_info_of_an_archive_is_that_of_its_lens(tmp_path, capsys):
 
 
 def test_an_archive_is_not_written(tmp_path):
-    with pytest.raises(LensFileError, match=r"a \.zar file is read, but not written; expected one of \.zmx"):
+    with pytest.raises(LensFileError, match=r"\.zar .*not written; expected .*\.zmx"):
         convert("double_gauss", tmp_path / "lens.zar")
 
 
 def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
     path = written(tmp_path, {"A.ZMX": singlet(surface="CONI x")})
-    with pytest.raises(LensFileError, match=r"lens\.zar \(A\.ZMX\):23, surface 1: CONI: conic constant is 'x'"):
+    with pytest.raises(LensFileError, match=r"lens\.zar \(A\.ZMX\):23, surface 1: .*'x'"):
         read_lens(path)
 
 
@@ -181,9 +181,9 @@ def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
 
 
 def test_an_archive_without_a_lens_lists_its_members(tmp_path):
-    with pytest.raises(LensFileError, match=r"no lens \(\.zmx\) among its 2 members \(A\.CFG, B\.AGF\)"):
+    with pytest.raises(LensFileError, match=r"no lens .* 2 members \(A\.CFG, B\.AGF\)"):
         read_lens(written(tmp_path, {"A.CFG": b"", "B.AGF": SMALL}))
-    with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\), none with its own name"):
+    with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\)"):
         read_lens(written(tmp_path, {"A.ZMX": singlet(), "B.ZMX": singlet()}))
 
 
@@ -336,7 +336,7 @@ def test_a_lens_is_written_with_its_catalog_and_read_again(tmp_path):
     elsewhere.mkdir()
     with (
         pytest.warns(UserWarning, match="its index differs"),
-        pytest.raises(LensFileError, match="put its catalog into the folder of the file"),
+        pytest.raises(LensFileError, match="catalog into the folder of the file"),
     ):
         convert(path, elsewhere / "again.zmx")
     assert not any(elsewhere.iterdir())
@@ -358,7 +358,7 @@ def test_many_large_catalogs_are_bounded_together_and_parsed_where_glasses_are_a
 def test_a_catalog_of_too_many_glasses_is_refused():
     text = "".join(f"NM G{k} 2 0 1.5 60\n" for k in range(MOST_GLASSES + 1))
     for read in (parse_agf, listed):
-        with pytest.raises(CatalogError, match=f"{MOST_GLASSES + 1} glasses, more than any catalog"):
+        with pytest.raises(CatalogError, match=f"{MOST_GLASSES + 1} glasses"):
             read(text, "many.agf")
 
 

@@ -170,7 +170,7 @@ def test_a_focal_length_round_trips_in_every_unit(tmp_path):
 def test_a_unit_that_no_file_has_is_refused_by_name(tmp_path):
     original = lens(tail="EFFL 0 2 0 0 0 0 50 1 0 0")
     other = dataclasses.replace(original, optimization_data=dataclasses.replace(original.optimization_data, unit=3.0))
-    with pytest.raises(LensFileError, match=r"a unit of 3\.0 mm, expected 1, 10, 25\.4 or 1000"):
+    with pytest.raises(LensFileError, match=r"3\.0 mm, .* 1, 10, 25\.4 or 1000"):
         write_lens(other, tmp_path / "lens.zmx")
 
 
@@ -294,7 +294,7 @@ def test_bounds_on_one_side_are_kept_and_lost_bounds_reported(unit, tmp_path):
     data = dataclasses.replace(original.optimization_data, variables=(curvature, *bound))
     assert again(dataclasses.replace(original, optimization_data=data), tmp_path).optimization_data == data
     steep = dataclasses.replace(data, variables=(dataclasses.replace(curvature, bounds=(0.0, 0.1)), *bound))
-    with pytest.warns(LensFileWarning, match=r"other than thicknesses \('curvature of surface 1'\)"):
+    with pytest.warns(LensFileWarning, match=r"thicknesses .*'curvature of surface 1'"):
         write_lens(dataclasses.replace(original, optimization_data=steep), tmp_path / "again.zmx")
     assert read_lens_with_report(tmp_path / "again.zmx")[0].optimization_data == data
 
@@ -307,7 +307,7 @@ def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
     assert (ray.numbers, ray.target, ray.weight) == ((0, 0.7, 0.5, 0), 0.25, 0.125)
     assert (length.target, length.weight, length.further) == (2, 1, ())
     (tmp_path / "other.MF").write_text("nothing of a merit\n")
-    with pytest.raises(LensFileError, match=r"other\.MF: no operand of a merit function in 1 lines"):
+    with pytest.raises(LensFileError, match=r"other\.MF: no operand .* 1 lines"):
         read_merit(tmp_path / "other.MF")
 
 
@@ -344,7 +344,7 @@ def test_check_lists_variables_and_evaluated_operands(tmp_path):
 
 
 def test_a_table_reports_that_it_holds_no_optimisation_data(tmp_path):
-    with pytest.warns(LensFileWarning, match=r"the optimisation data \('12 rows of a merit function'\)"):
+    with pytest.warns(LensFileWarning, match=r"'12 rows of a merit function'"):
         write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")
 
 

@@ -273,12 +273,12 @@ def test_unmodelled_features_are_refused_by_name_surface_and_line(second, messag
 @pytest.mark.parametrize("surface", [0, 4])
 def test_object_and_image_are_no_breaks_and_bend_no_light(kind, surface):
     content = text("standard").replace(f"SURF {surface}\n  TYPE STANDARD", f"SURF {surface}\n  TYPE {kind}")
-    with pytest.raises(UnsupportedSurface, match=f"surface {surface}: type {kind} .* of the object or the image"):
+    with pytest.raises(UnsupportedSurface, match=f"surface {surface}: type {kind} .*object or the image"):
         read(content)
 
 
 def test_an_object_is_perpendicular_to_the_axis():
-    with pytest.raises(UnsupportedSurface, match="surface 0: type STANDARD of the object with a tilt"):
+    with pytest.raises(UnsupportedSurface, match=r"surface 0: .*object with a tilt"):
         read(text("standard").replace("SURF 0\n", "SURF 0\n  SCBD 2 0 0 0 0 5 0 0\n"))
 
 
