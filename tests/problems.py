@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,9 @@ from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Aperture, Surface
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, scene
+
+#: Files of third parties, which no clone has: tests of them are marked `needs(FOLDER, …)`.
+SHARED = Path(__file__).parents[2] / "shared"
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
 both_engines = pytest.mark.parametrize("engine", ["eager", "compiled"], indirect=True)

@@ -8,10 +8,10 @@ import dataclasses
 import functools
 import json
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
+from problems import SHARED
 
 from raytrace.io import UnsupportedSurface, read_lens
 from raytrace.io.zemax.surfaces import types
@@ -22,7 +22,7 @@ from raytrace.system.rays import start
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import steps
 
-CORPUS = Path(__file__).parents[2] / "shared" / "corpus"
+CORPUS = SHARED / "corpus"
 RIGHT, REFUSED, WRONG = "loaded and right", "refused by name", "wrong"
 
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
@@ -202,17 +202,16 @@ def numbers(result: Comparison) -> dict[str, str]:
 
 
 FILES = sorted(oracle()) if (CORPUS / "oracle.json").exists() else []
-needs_corpus = pytest.mark.skipif(not FILES, reason=f"no {CORPUS}: the corpus is not part of a clone")
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", FILES)
 def test_file_is_right_or_refused_by_name(name):
     result = compare(name)
     assert result.outcome != WRONG, result.details
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 def test_unsupported_files_are_the_refused_ones():
     """A file is refused for what the oracle knows the project not to model, or for a glass that is not shipped."""
     modelled = set(types())
@@ -222,7 +221,7 @@ def test_unsupported_files_are_the_refused_ones():
         assert (result.outcome == REFUSED and "UnsupportedSurface" in result.details) == bool(beyond), name
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 def test_other_editions_are_still_other_and_their_differences_as_listed():
     found = {}
     for name in FILES:

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 import test_corpus
 import torch
+from problems import SHARED
 from problems import number as real
 from test_corpus import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison
 from zemax_by_definition import surfaces, trace
@@ -33,9 +34,8 @@ from raytrace.system.rays import start
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import axial_path, steps
 
-CORPUS = Path(__file__).parents[2] / "shared" / "tier2"
+CORPUS = SHARED / "tier2"
 FILES = json.loads((CORPUS / "oracle_dev.json").read_text())["files"] if (CORPUS / "oracle_dev.json").exists() else {}
-needs_corpus = pytest.mark.skipif(not FILES, reason=f"no {CORPUS}: the corpus is not part of a clone")
 
 INDEX_TOLERANCE = 1e-6
 FIRST_ORDER_TOLERANCE = 1e-8  # relative: a few hundred roundings of two programs in float64
@@ -216,14 +216,14 @@ def reproduced(name: str) -> tuple[int, int, float]:
     return best
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", FILES)
 def test_file_is_right(name):
     result = compare(name)
     assert result.outcome == RIGHT, result.details
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", [name for name in FILES if FILES[name]["stored_semidiameters"]["matched"]])
 @pytest.mark.filterwarnings("ignore")
 def test_stored_semi_diameters_are_reproduced(name):
@@ -233,7 +233,7 @@ def test_stored_semi_diameters_are_reproduced(name):
     assert matched == expected["matched"] == total
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", FILES)
 def test_the_definitions_of_the_tests_are_those_of_the_oracle(name):
     """The tracer by definition, against which surfaces of every type are held, where it knows all media."""

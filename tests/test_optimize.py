@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize
 from scripts import script
 
@@ -363,7 +363,7 @@ def test_the_figure_shows_before_and_after(triplet, tmp_path):
 
 # -- files with a merit function, where they are at hand ---------------------------------------------------------------
 
-FILES = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+FILES = SHARED / "merit" / "dev"
 KNOWN = json.loads((FILES / "oracle.json").read_text())["files"] if (FILES / "oracle.json").exists() else []
 QUICK = ("sc_hamm2", "Schmidt-Cassegrain", "sc_slit", "PyZDDE__Doublet", "sc_cooke2", "AchromaticAt800")
 
@@ -376,6 +376,7 @@ def of_files():
             yield pytest.param(known, marks=marks, id=known["file"])
 
 
+@pytest.mark.needs(FILES)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("known", [*of_files()])
 def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(known):

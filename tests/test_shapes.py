@@ -5,12 +5,11 @@ import dataclasses
 import json
 import math
 from decimal import Decimal, localcontext
-from pathlib import Path
 
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
-from problems import both_engines, field, lens, scalar, scene_of, surface, vector
+from problems import SHARED, both_engines, field, lens, scalar, scene_of, surface, vector
 from torch.testing import assert_close
 
 import raytrace as rt
@@ -37,7 +36,6 @@ from raytrace.tracing.spot import spot_of
 from raytrace.tracing.streaming import stream_spot
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
-SHARED = Path(__file__).parents[2] / "shared"
 TIER2, CORPUS = SHARED / "tier2", SHARED / "corpus"
 ODD = "odd asphere"
 CURVATURE, CONIC = 0.02, -0.6
@@ -171,7 +169,7 @@ def test_the_tip_of_a_cone_makes_no_nan(engine, dtype):
     assert float(end.direction[1, 3]) == pytest.approx(math.sin(bent), rel=1e-6)
 
 
-@pytest.mark.skipif(not TIER2.exists(), reason="needs ../shared/tier2")
+@pytest.mark.needs(TIER2)
 def test_a_file_of_another_hand_is_traced_as_its_oracle_says():
     found = read_lens(TIER2 / "dev" / "oddasphe.zmx")
     oracle = json.loads((TIER2 / "oracle_dev.json").read_text())["files"]["oddasphe.zmx"]
@@ -451,7 +449,7 @@ def test_a_scene_with_a_polygon_has_no_symmetry_and_a_figure(tmp_path):
     assert float(found.energy) == pytest.approx(share, rel=3e-2)
 
 
-@pytest.mark.skipif(not SLIT.exists(), reason="needs ../shared/corpus")
+@pytest.mark.needs(CORPUS)
 def test_slits_of_a_real_file():
     """Six bars of 1 × 12 mm, one every 2 mm, as user-defined aperture that is shifted by half a bar."""
     (aperture,) = read_lens(SLIT).surfaces[1].apertures

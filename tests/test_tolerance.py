@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
@@ -191,10 +191,11 @@ def test_compensators_that_the_lens_does_not_have_or_need(triplet):
             rt.tolerance(triplet, dataclasses.replace(rows, compensators=(one,)), trials=0)
 
 
-FILES = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+FILES = SHARED / "tolerance" / "dev"
 
 
 @pytest.mark.slow
+@pytest.mark.needs(FILES)
 @pytest.mark.parametrize("file", sorted(FILES.glob("*.zmx")), ids=lambda file: file.stem)
 def test_tolerances_of_a_file(file):
     """Whatever light is lost: of SC_Tol_RflScp2 decentres may leave the most clipped of five fields in the dark."""
