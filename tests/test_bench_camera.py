@@ -21,11 +21,6 @@ def small(monkeypatch):
     monkeypatch.setattr(camera, "TOLERANCES", (0.1, 0.03))
 
 
-@pytest.fixture
-def lens():
-    return rt.focus("cooke_triplet").lens
-
-
 @pytest.mark.slow
 def test_every_row_and_the_figure(capsys, tmp_path):
     assert main(["bench", "camera", "--repeats", "1", "--threads", "1", "--json"]) == 0
@@ -48,19 +43,19 @@ def test_a_lens_of_the_user_has_its_largest_field_in_the_corners(capsys):
     assert f"Lens tessar at its best focus, sensor of {chip.size[0]:.4g} × {chip.size[1]:.4g} mm" in text
 
 
-def test_the_error_is_seen(lens, monkeypatch):
+def test_the_error_is_seen(focused_triplet, monkeypatch):
     """A picture that is wrong by 2 % has that error; one of many kernels has less than 1e-3."""
     monkeypatch.setattr(camera, "_CROP", 4)
     picture = torch.rand(3, 72, 96, generator=torch.Generator().manual_seed(0))
-    system = camera.blur_alone(lens, SMALL, nodes=(19, 25), tol=1e-3, order=4)
+    system = camera.blur_alone(focused_triplet, SMALL, nodes=(19, 25), tol=1e-3, order=4)
     with torch.no_grad():
         image = system(picture, boundary="zero")
-    assert camera.error(lens, system, picture, image) < 2e-3
-    assert camera.error(lens, system, picture, 1.02 * image) == pytest.approx(0.02, abs=2e-3)
+    assert camera.error(focused_triplet, system, picture, image) < 2e-3
+    assert camera.error(focused_triplet, system, picture, 1.02 * image) == pytest.approx(0.02, abs=2e-3)
 
 
-def test_a_step_has_gradients_by_every_variable(lens):
-    variables = rt.Variables(lens, "curvature thickness")
+def test_a_step_has_gradients_by_every_variable(focused_triplet):
+    variables = rt.Variables(focused_triplet, "curvature thickness")
     patches = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     points = torch.tensor([[0.0, 3.0], [0.0, 4.0]], dtype=torch.float64)
     how = {"sensor": SENSOR, "size": 21, "order": 4}

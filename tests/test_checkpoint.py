@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_stores import STRANGE, put
+from problems_stores import STRANGE, put
 
 import raytrace as rt
 from raytrace import stores

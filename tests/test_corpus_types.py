@@ -17,11 +17,10 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import test_corpus
 import torch
+from corpus_comparison import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison, numbers, table
 from problems import SHARED
 from problems import number as real
-from test_corpus import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison
 from zemax_by_definition import surfaces, trace
 
 from raytrace.io import UnsupportedSurface, read_lens
@@ -311,7 +310,7 @@ def by_file() -> list[dict[str, str]]:
         details = details if result.outcome == RIGHT else result.details
         types_here = ", ".join(types_of(name))
         here = {"corpus": "surface types", "file": name, "types": types_here}
-        rows.append(here | test_corpus.numbers(result) | {"details": details})
+        rows.append(here | numbers(result) | {"details": details})
     return rows
 
 
@@ -332,7 +331,7 @@ def document(rows: list[dict[str, str]]) -> str:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    every, folder = by_file() + test_corpus.table(), Path(sys.argv[1])
+    every, folder = by_file() + table(), Path(sys.argv[1])
     (folder / "corpus.md").write_text(document(every), encoding="utf-8")
     with (folder / "corpus.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, every[0], lineterminator="\n")

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 import torch
-from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
+from layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 import raytrace
 

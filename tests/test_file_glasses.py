@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch
-from test_zemax import file, read
+from problems_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main

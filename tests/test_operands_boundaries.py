@@ -5,30 +5,25 @@ written out again on torch's sag and trace.
 """
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from problems import SHARED, fields, lens, scalar, surface, vector
+from problems import SHARED, fields, lens, scalar, semi_diameters, surface, vector
 
 import raytrace as rt
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
 from raytrace.optimization.lens_state import Bundle
 from raytrace.optimization.merit import LOST, Evaluation
-from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
+from raytrace.optimization.operands.boundaries import BOUNDARIES, SemiDiameters
 from raytrace.optimization.operands.operand import Conventions, EvaluationContext, Planner
 from raytrace.optimization.variables import DesignVariables
-from raytrace.system.lens import media
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.trace import trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -89,29 +84,6 @@ OF_ONE = [name for name in BOUNDARIES if name not in OF_RANGES]
 
 
 # -- the definitions again ---------------------------------------------------------------------------------------------
-
-
-@functools.cache
-def semi_diameters(found) -> list[float]:
-    """By torch's trace, surface by surface."""
-    points = torch.tensor(ENDS, dtype=torch.float64).T
-    percent, length = found.optimization_data.semi_diameter_margin
-    sizes = [0.0 if found.surfaces[0].semi_diameter is None else found.surfaces[0].semi_diameter]
-    for k in range(1, len(found.surfaces)):
-        if k in found.optimization_data.semi_diameters:
-            sizes.append(found.surfaces[k].semi_diameter)
-            continue
-        heights = [torch.zeros(())]
-        for wavelength in found.wavelengths:
-            for x, y in zip(found.fields.x, found.fields.y, strict=True):
-                field = torch.stack([x, y])[:, None]
-                rays = rays_of_field(found, field, vignette(found, field, points), wavelength=wavelength)
-                indices = media(found, wavelength)[: k + 1]
-                rays = trace_surfaces(found.surfaces[1 : k + 1], rays, indices=indices, wavelength=wavelength)
-                heights += [height for height in torch.hypot(*rays.position[:2])[rays.valid]]
-        bare = k in (found.stop, len(found.surfaces) - 1)
-        sizes.append(float(max(heights)) * (1 if bare else 1 + percent / 100) + (0 if bare else length))
-    return sizes
 
 
 def closing(surface, size) -> float:

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from test_zemax_types import CASES, read, text
+from problems_zemax_types import CASES, read, text
 
 import raytrace as rt
 from raytrace.tracing.lens_report import entries, remarks

@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from test_layers import MODULES
+from layers import MODULES
 
 import raytrace as rt
 from raytrace.cli import main

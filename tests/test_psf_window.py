@@ -6,7 +6,7 @@ import pytest
 import torch
 from differences import gradcheck
 from problems import scalar, sharp_double_gauss, vector
-from test_psf_derivatives import moved
+from problems_psf import moved
 
 import raytrace as rt
 from raytrace.maths.sampling import grid

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from problems import random
 
 import raytrace as rt
 from raytrace.budget import OverBudget, within
@@ -54,10 +55,6 @@ def ready(lens, sensor=FIELD, **options):
         warnings.simplefilter("ignore")
         how = {"model": "gaussian", "wavelengths": lens.wavelengths, "nodes": (3, 4), "order": 4, "tol": 1e-9}
         return optics(lens, sensor, **{**how, **options})  # no low rank
-
-
-def random(*shape, seed=0):
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def direct(picture, kernels, *, boundary="zero"):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
-from problems import SHARED, focal_length
-from test_operands_boundaries import semi_diameters
+from problems import SHARED, focal_length, semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index

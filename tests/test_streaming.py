@@ -393,7 +393,8 @@ def test_chunk_shrinks_with_the_budget_and_the_stored_rays():
 MEMORY = """
 import ctypes, resource, sys, torch
 sys.path.insert(0, "tests")
-from problems import double_gauss, aspheric_singlet, vector
+from problems import double_gauss, vector
+from problems import aspheric_singlet
 from raytrace.tracing import streaming
 from raytrace.maths.sampling import grid
 from raytrace.psf_models import DRT, Execution, psf

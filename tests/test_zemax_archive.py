@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_catalogs import SMALL
-from test_zemax import file as singlet
+from problems_zemax import SMALL, archive, bits, header, lzw
+from problems_zemax import file as singlet
 
 from raytrace import check
 from raytrace.cli import main
@@ -30,45 +30,6 @@ def no_catalogs_from_the_environment(monkeypatch):
 
 
 # -- a packer of our own ----------------------------------------------------------------------------------------------
-
-
-def lzw(content: bytes) -> bytes:
-    """The codes of LZW, of 9 bits and more, the highest bit first, padded with zeros to whole bytes."""
-    words, codes, before = {bytes([k]): k for k in range(256)}, [], b""
-    for k in range(len(content)):
-        longer = before + content[k : k + 1]
-        if longer not in words:
-            codes.append(words[before])
-            words[longer] = len(words)
-            longer = content[k : k + 1]
-        before = longer
-    return bits([*codes, *([words[before]] if before else [])])
-
-
-def bits(codes: list[int]) -> bytes:
-    """Codes as bits: code k, from 0, has as many as the dictionary of its reader then needs."""
-    text = "".join(f"{code:0{(255 + max(k, 1)).bit_length()}b}" for k, code in enumerate(codes))
-    return int(text.ljust(-(-len(text) // 8) * 8, "0") or "0", 2).to_bytes(-(-len(text) // 8), "big")
-
-
-def header(name: str, size: int, version: int) -> bytes:
-    if version == 0xEA:
-        head = bytearray(0x14C)
-        head[0x0C:0x10], head[0x20 : 0x20 + len(name)] = size.to_bytes(4, "little"), name.encode("latin-1")
-    else:
-        head = bytearray(0x288)
-        head[0x10:0x18], head[0x30 : 0x30 + 2 * len(name)] = size.to_bytes(8, "little"), name.encode("utf-16-le")
-    head[0] = version
-    return bytes(head)
-
-
-def archive(files: dict[str, str | bytes], version: int = 0xEC, packed: bool = True) -> bytes:
-    parts = []
-    for name, content in files.items():
-        content = content if isinstance(content, bytes) else content.encode("utf-16")
-        content, name = (lzw(content), f"{name}.LZW") if packed else (content, name)
-        parts += [header(name, len(content), version), content]
-    return b"".join(parts)
 
 
 def written(folder: Path, files: dict, name: str = "lens.zar", **kind) -> Path:

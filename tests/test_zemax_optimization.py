@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 from problems import SHARED
-from test_formats import leaves
-from test_zemax import file, lens
-from test_zemax import read as read_text
+from problems_files import leaves
+from problems_zemax import file, lens
+from problems_zemax import read as read_text
+from problems_zemax_optimization import CONFIGURED, MERIT_LINES, RULES, STOP_RULES
 
 import raytrace as rt
 from raytrace.io import read_lens_with_report, write_lens
@@ -82,33 +83,6 @@ def test_variables_and_rows_are_those_of_an_independent_reader():
             assert row.weight == pytest.approx(one["weight"], rel=1e-15)
         met += 1
     assert met >= 17
-
-
-RULES = """TYPE EVENASPH
-CURV 0.02 1 0 0 0 ""
-VDSZ 0 0
-VCON
-PARM 2 1e-5
-VPAR 2
-PARM 3 0
-VPAR 3"""
-STOP_RULES = "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1\nTOLE 1 5\nEDGE 0.5 3\nCURV -0.02 4 1 -1 0"
-MERIT_LINES = """DMFS 0 0 0 0 0 0 0 0 0 0
-BLNK A text,  with blanks.
-TRAC 0 1 0 0.7 3.35E-1 0 0 7.27E-2 0 0
-EFFL 0 2 0 0 0 0 2.5 1 0 0
-MXCV 1 2 0 0 0 0 0.05 1 0 0
-CONS 0 0 0 0 0 0 1.5 0 0 0
-DIFF 4 6 0 0 0 0 1 1 0 0
-DIVI 4 6 0 0 0 0 1 1 0 0
-RECI 4 0 0 0 0 0 0.4 1 0 0
-SSAG 1 2 0.5 0.25 0 0 0.125 1 0 0
-PMVA 1 2 0 0 0 0 1e-5 1 0 0
-QQQQ 1 2 3 4 5 6 7 8 9 10 AUTO
-TOL TOFF   0   0              0              0   0 0 0
-TOL TTHI   1   2 -0.25 0.5   0 0 0
-TCMM A comment.
-MNUM 1 1"""
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -237,17 +211,6 @@ def test_unsupported_solves_are_kept_reported_and_round_trip(tmp_path):
     for one in original.optimization_data.kept:
         assert any(note.endswith(f"not followed when the lens is optimised: {one}") for note in report.notes)
     assert again(original, tmp_path).optimization_data == original.optimization_data
-
-
-CONFIGURED = """MNUM 2 1
-MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""
-MOFF   0   2 "" 0 0 0 1 1 0 0.0 ""
-THIC   1   1 4 1 0 0 1 1 1.0 0.0 0
-THIC   1   2 5 1 0 0 1 1 1.0 0.0 0
-CRVT   2   1 -0.02 0 0 0 1 1 1.0 0.0 0
-CRVT   2   2 -0.04 2 0 0 1 3 2.0 0.0 0
-PRAM   1   1 1E-5 1 2 0 1 1 1.0 0.0 0
-PRAM   1   2 2E-5 0 2 0 1 1 1.0 0.0 0"""
 
 
 def test_numbers_of_configurations_vary_one_by_one_and_void_the_variable_of_the_surface(tmp_path):

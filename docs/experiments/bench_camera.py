@@ -4,6 +4,7 @@ raytrace bench camera --repeats 15 --threads 2 -o camera.json
 python docs/experiments/bench_camera.py camera.json docs/bench_camera.png
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,17 @@ def figure(rows: Sequence[Mapping]) -> Figure:
     return drawing
 
 
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("document", type=Path, help="JSON document of the command")
+    parser.add_argument("figure", help="file to write (.png, .pdf, .svg)")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    options(parser)
+    arguments = parser.parse_args(argv)
+    save(figure(json.loads(arguments.document.read_text(encoding="utf-8"))["rows"]), arguments.figure)
+
+
 if __name__ == "__main__":
-    document, picture = sys.argv[1:]
-    save(figure(json.loads(Path(document).read_text(encoding="utf-8"))["rows"]), picture)
+    sys.exit(main())
