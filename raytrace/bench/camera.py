@@ -11,13 +11,14 @@ import resource
 import statistics
 from collections.abc import Callable, Mapping
 from operator import attrgetter
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from raytrace.analysis.focus_report import focus
 from raytrace.bench.measure import clock
-from raytrace.bench.result import Measured, clock_name, machine
+from raytrace.bench.result import Measured, Quantity, clock_name, machine
 from raytrace.cli.progress import progress
 from raytrace.imaging.field_kernels import FieldKernels
 from raytrace.imaging.pictures import dead_leaves
@@ -49,7 +50,7 @@ class Row:
     error: float | None = None
 
 
-PRINTED = {
+PRINTED: Mapping[Column, Quantity] = {
     Column("work", form="<"): attrgetter("what"),
     Column("tolerance", form="g"): attrgetter("tol"),
     Column("kernels", form="<"): attrgetter("kernels"),
@@ -129,10 +130,10 @@ def scene(pixels: tuple[int, int]) -> Tensor:
     return picture[:, :rows, :columns]
 
 
-def blur_alone(lens: Lens, sensor: Sensor, **options) -> ImageFormation:
+def blur_alone(lens: Lens, sensor: Sensor, **options: Any) -> ImageFormation:
     """The Gaussian blur of the lens at its own wavelengths."""
-    how = {"model": "gaussian", "wavelengths": lens.wavelengths, "distortion": False, "illumination": False}
-    return optics(lens, sensor, **how, **options)
+    options |= {"model": "gaussian", "wavelengths": lens.wavelengths}
+    return optics(lens, sensor, distortion=False, illumination=False, **options)
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """`raytrace bench`: the subject, its options and its threads."""
 
 import argparse
+from collections.abc import Callable
 
 import torch
 
@@ -11,7 +12,7 @@ from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
 
 #: The measurement of a subject, its default lenses, its own settings, and whether it has a figure.
-_SUBJECTS = {
+_SUBJECTS: dict[str, tuple[Callable[..., Measured], tuple[str, ...], tuple[str, ...], bool]] = {
     "trace": (trace.bench, ("double_gauss",), ("rays", "device"), True),
     "psf": (psf.bench, ("double_gauss", "phone"), (), True),
     "camera": (camera.bench, ("cooke_triplet",), ("sensor",), False),

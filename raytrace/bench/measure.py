@@ -8,6 +8,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,9 +27,10 @@ SHORTEST = 0.02  # s: shorter calls are timed many at a time
 _MOST_CALLS = 200
 
 Job = Callable[[], object]
+K = TypeVar("K")
 
 
-def nothing(*_) -> None:
+def nothing(*_: object) -> None:
     """No progress."""
 
 
@@ -62,7 +64,8 @@ class Tracer:
     def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]:
         """Derivatives of the mean squared distance from `centroid` (2,) with respect to `variables`."""
         end = trace_surfaces(self.surfaces, self._with_path(rays), indices=self.indices, wavelength=self.lens.primary)
-        return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)
+        x, y, _ = end.position
+        return torch.autograd.grad(squared_radius(x, y, centroid), self.leaves)
 
     def _with_path(self, rays: Rays) -> Rays:
         return dataclasses.replace(rays, opl=torch.zeros_like(rays.direction[0]) if self.with_path else None)
@@ -140,17 +143,14 @@ def wait_for_devices() -> None:
 
 
 def in_turns(
-    jobs: Mapping[object, Job], *, repeats: int, threads: int, progress: Callable[[int], object] = nothing
-) -> dict[object, list[float]]:
-    """Seconds of each job. Jobs take turns, so that other load affects all alike; short calls are timed many at a time.
-
-    progress: called with 1 for each, `repeats` times the jobs.
-    """
+    jobs: Mapping[K, Job], *, repeats: int, threads: int, progress: Callable[[int], object] = nothing
+) -> dict[K, list[float]]:
+    """Seconds of each job. Jobs take turns, so that other load affects all alike; short calls are repeated."""
     calls = {}
     for name, job in jobs.items():
         seconds_of(job, 1, threads)  # warm up
         calls[name] = max(1, min(_MOST_CALLS, math.ceil(SHORTEST / max(seconds_of(job, 1, threads), 1e-6))))
-    seconds: dict[object, list[float]] = {name: [] for name in jobs}
+    seconds: dict[K, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats):
         for name, job in jobs.items():
             seconds[name].append(seconds_of(job, calls[name], threads))
@@ -182,7 +182,7 @@ class Row:
 
 
 def measured_rows(
-    tasks: Sequence[tuple[Tracer, str, Mapping[str, float | None]]], lens: Lens, count: int, *, sizes: Sequence[int],
+    tasks: Sequence[tuple[Tracer, str, Mapping[str, Any]]], lens: Lens, count: int, *, sizes: Sequence[int],
     graphs: Callable[[Tracer], int | None], repeats: int, threads: int, progress: Callable[[int], object] = nothing,
 ) -> list[Row]:  # fmt: skip
     """A row of each task: a tracer, its work, and its errors as in `Row`.
@@ -200,7 +200,8 @@ def measured_rows(
         call = tracer.forward if work == "forward" else lambda part: tracer.gradient(part, centroid)
         if size >= count:
             return lambda: call(batch)
-        parts = [some(batch, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
+        cuts = [slice(first, first + size) for first in range(0, count, size)]
+        parts = [Rays(batch.position[:, cut], batch.direction[:, cut], batch.valid[cut]) for cut in cuts]
         return lambda: [call(part) for part in parts]
 
     jobs, pieces = {}, []
@@ -212,7 +213,7 @@ def measured_rows(
             for choice in choices.values():
                 seconds_of(choice, 1, threads)  # warm up
             trials = {size: min(seconds_of(choice, 1, threads) for _ in range(2)) for size, choice in choices.items()}
-            piece = min(trials, key=trials.get)
+            piece = min(trials, key=trials.__getitem__)
         jobs[k] = choices[piece]
         pieces.append(piece)
     turns = in_turns(jobs, repeats=repeats, threads=threads, progress=progress)

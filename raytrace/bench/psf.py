@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.measure import DTYPES, clock, name_of, nothing, with_leaves
-from raytrace.bench.result import Measured, clock_name, curves, machine
+from raytrace.bench.result import Figure, Measured, Quantity, clock_name, curves, machine
 from raytrace.cli.progress import progress
 from raytrace.maths.numerics import to
 from raytrace.maths.result import Column
@@ -27,9 +27,8 @@ from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import MODELS, NotConverged, Psf, direct_sum, drt, paraxial, psf
 from raytrace.psf_models.direct_sum import moments
 from raytrace.psf_models.gaussian import gaussian_pixels
-from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.psf_models.result import Kernels
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.scene import Scene, scene
 
@@ -98,8 +97,8 @@ def methods() -> list[Method]:
     """Every model at several orders, and `psf(…, tol=…)` with the estimate of its error."""
 
     def to_tolerance(model: str, tol: float, scene: Scene, grid: Grid) -> Psf:
-        conditions = {"fields": scene.fields, "wavelengths": scene.wavelengths}
         distances = scene.lens.surfaces[0].thickness.flatten()
+        conditions: dict[str, Any] = {"fields": scene.fields, "wavelengths": scene.wavelengths}
         return psf(scene.lens, model, object_distances=distances, grid=grid, tol=tol, **conditions)
 
     references = {model: "rays" if model == "drt" else model for model in _ORDERS}
@@ -111,17 +110,17 @@ def methods() -> list[Method]:
             chosen.append(Method(model, sampling, run, references[model]))
     for model, tolerances in _TOLERANCES.items():
         for tol in tolerances:
-            run = functools.partial(to_tolerance, model, tol)
-            chosen.append(Method(model, f"tol {tol:.0e}".replace("e-0", "e-"), run, references[model]))
+            name, to_tol = f"tol {tol:.0e}".replace("e-0", "e-"), functools.partial(to_tolerance, model, tol)
+            chosen.append(Method(model, name, to_tol, references[model]))
     return chosen
 
 
 def _pitch(lens: Lens, field: float, distance: float) -> float:
     """The pixel pitch whose window of PIXELS holds 7 σ of the rays and 8 λN."""
     with torch.no_grad():
-        light = gaussian_kernels(Case(lens, "", field, distance, 1.0).scene, grid(1.0, 1), order=8)
-        width = 7 * float(light.covariance[::2].max().sqrt())
-        number = float(first_order(with_object_distance(lens, distance)).paraxial_working_f_number)
+        light = MODELS["gaussian"].kernels(Case(lens, "", field, distance, 1.0).scene, grid(1.0, 1), order=8)
+        width = 7 * float(light.ray_moments[1][::2].max().sqrt())
+        number = float(first_order(lens.at(object_distance=distance)).paraxial_working_f_number)
     airy = 8e-3 * float(lens.primary) * number
     return max(width, airy if math.isfinite(airy) else 0.0, 1e-6) / PIXELS
 
@@ -197,19 +196,15 @@ class PsfRow:
     against: str = "rays"
 
 
-def _milliseconds(name: str) -> Callable[[PsfRow], float | None]:
-    return lambda row: None if getattr(row, name) is None else 1e3 * getattr(row, name)
-
-
-PRINTED = {
+PRINTED: Mapping[Column, Quantity] = {
     Column("lens", form="<"): attrgetter("lens"),
     Column("field", form="g"): attrgetter("field"),
     Column("model", form="<"): attrgetter("model"),
     Column("sampling", form="<"): attrgetter("sampling"),
     Column("dtype", form="<"): attrgetter("dtype"),
     Column("rays", form=".0f"): attrgetter("rays"),
-    Column("forward", "ms", ".3g"): _milliseconds("forward_s"),
-    Column("both", "ms", ".3g", "with\ngradient"): _milliseconds("both_s"),
+    Column("forward", "ms", ".3g"): lambda row: 1e3 * row.forward_s,
+    Column("both", "ms", ".3g", "with\ngradient"): lambda row: row.both_s and 1e3 * row.both_s,
     Column("L1", form=".1e", heading="L1\nerror"): attrgetter("l1_error"),
     Column("sigma", form=".1e", heading="σ\nerror"): attrgetter("sigma_error"),
     Column("centroid", form=".1e", heading="centroid\nerror"): attrgetter("centroid_error"),
@@ -291,7 +286,8 @@ def gradient(method: Method, scene: Scene, grid: Grid) -> tuple[Tensor | None, .
 
 def timed(call: Callable[[], object], repeats: int, threads: int) -> float:
     """Median time of a call; slow ones are repeated less often."""
-    now, seconds, end = clock(threads), [], time.perf_counter() + _LIMIT
+    seconds: list[float] = []
+    now, end = clock(threads), time.perf_counter() + _LIMIT
     while not seconds or (len(seconds) < repeats and time.perf_counter() < end):
         start = now()
         call()
@@ -320,7 +316,7 @@ def relative_l1(kernel: Tensor, reference: Tensor) -> float:
     return float((kernel - reference).abs().sum() / reference.sum())
 
 
-def figure(rows: Sequence[PsfRow]):
+def figure(rows: Sequence[PsfRow]) -> Figure:
     """Time over error of every model at fixed samplings in float64, a panel for each case."""
     panels: dict[str, dict[str, list]] = {}
     for row in sorted(rows, key=attrgetter("rays")):

@@ -35,23 +35,21 @@ class Measured(Result):
     def document(self) -> dict:
         return self.about | {"rows": [plain(dataclasses.asdict(row)) for row in self.rows]}
 
-    def to_frame(self):
+    def to_frame(self) -> Any:
         """All quantities of the rows for pandas."""
         import pandas
 
         return pandas.DataFrame(list(map(dataclasses.asdict, self.rows)))
 
     def tables(self) -> list[Table]:
-        columns = {column: [_shown(quantity(row)) for row in self.rows] for column, quantity in self.printed.items()}
+        columns: dict[str | Column, list] = {}
+        for column, quantity in self.printed.items():
+            columns[column] = [math.nan if (value := quantity(row)) is None else value for row in self.rows]
         machine = "; ".join(f"{name}: {value}" for name, value in self.about["machine"].items())
         return [Table(columns, notes=("", *self.notes, f"Machine: {machine}."))]
 
-    def draw(self, **options) -> Figure:
+    def draw(self, **options: Any) -> Figure:
         return self.figure(self.rows) if self.figure else super().draw(**options)
-
-
-def _shown(value: float | str | None) -> float | str:
-    return math.nan if value is None else value
 
 
 def machine() -> dict[str, str | int]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from raytrace.bench.measure import (
     surfaces_of,
     variables,
 )
-from raytrace.bench.result import Measured, clock_name, curves, machine
+from raytrace.bench.result import Figure, Measured, Quantity, clock_name, curves, machine
 from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError
 from raytrace.maths.numerics import to
@@ -28,7 +29,7 @@ PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, and 
 LARGEST_GRAPH = 200_000  # rays whose graph is held at once
 WORKS = ("forward", "forward+backward")
 
-PRINTED = {
+PRINTED: Mapping[Column, Quantity] = {
     Column("rays", form=".0f"): attrgetter("rays"),
     Column("work", form="<"): attrgetter("what"),
     Column("dtype", form="<"): attrgetter("dtype"),
@@ -60,10 +61,11 @@ def bench(
             raise CommandError(f"--device {device}: torch cannot use this device ({reason})") from None
         tracers += [Tracer(lens, dtype, with_path=True, device=device) for dtype in DTYPES]
     tasks = [(tracer, work, error) for tracer in tracers for error in [errors_of(tracer, lens)] for work in WORKS]
-    counts, sizes = sorted(rays or COUNTS), {"sizes": PIECES, "graphs": lambda tracer: LARGEST_GRAPH}
+    counts = sorted(rays or COUNTS)
+    how: dict[str, Any] = {"sizes": PIECES, "graphs": lambda tracer: LARGEST_GRAPH, "repeats": repeats}
     with progress(len(counts) * repeats * len(tasks), "call", what="measuring") as bar:
-        how = {"repeats": repeats, "threads": threads, "progress": bar.update}
-        measurements = [row for count in counts for row in measured_rows(tasks, lens, count, **sizes, **how)]
+        how |= {"threads": threads, "progress": bar.update}
+        measurements = [row for count in counts for row in measured_rows(tasks, lens, count, **how)]
     about = {"lens": name, "surfaces": surfaces_of(lens), "repeats": repeats, "machine": machine()}
     notes = (
         f"Lens {name}, {surfaces_of(lens)} surfaces, stop and image included. Speed: millions of rays × surfaces / s, "
@@ -101,7 +103,7 @@ def _results(tracer: Tracer, lens: Lens) -> dict[str, Tensor]:
     return {name: values.double().cpu() for name, values in results.items()}
 
 
-def figure(rows: Sequence[Row]):
+def figure(rows: Sequence[Row]) -> Figure:
     """Speed over the number of rays, of tracers that compute the optical path."""
     panels: dict[str, dict[str, list]] = {}
     for row in rows:
