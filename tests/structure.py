@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from test_layers import FLOORS
+from layers import FLOORS
 
 import raytrace as rt
 from raytrace.system.lens import media
@@ -23,6 +23,8 @@ from raytrace.tracing.trace import cross
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Packages that no other imports: measurements.
 APART = ("bench",)
+#: Computations whose files `walks` lists.
+WALKS = ("read_lens", "refraction", 'psf(lens, "drt")', "optimize", "training step")
 #: Of every function that `shared` decorates: its call is that of its caller.
 _DECORATION = media.__code__
 

@@ -5,8 +5,7 @@ import warnings
 
 import pytest
 import torch
-from problems import vector
-from test_launch import fisheye
+from problems import fisheye, vector
 
 import raytrace as rt
 from raytrace.cli import build_parser

@@ -222,7 +222,7 @@ def test_analyses_about_an_axis_name_the_surface_that_folds_it():
         rt.seidel, rt.longitudinal_aberration, lambda one: rt.psf(one, "paraxial"), lambda one: rt.psf(one, "fourier"),
         lambda one: rt.compare(one),
     ):  # fmt: skip
-        with pytest.raises(Bent, match=r"needs one straight axis, but surface 11 is tilted or decentred; .+"):
+        with pytest.raises(Bent, match=r"straight axis, .*surface 11 is tilted or decentred; .+"):
             refused(lens)
 
 

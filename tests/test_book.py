@@ -65,10 +65,9 @@ def test_notebook_runs_within_its_time(page, tmp_path):
 
 
 @pytest.mark.parametrize("page", TUTORIALS, ids=name_of)
-def test_tutorial_is_short_and_asserts_its_figures(page):
+def test_tutorial_asserts_its_figures(page):
     text = page.read_text("utf-8")
     assert re.match(r"---\nfile_format: mystnb\nkernelspec:\n  name: python3\n---\n\n# \w", text)
-    assert len(text.splitlines()) <= 150
     assert len(re.findall(r"^\s*assert ", code(page), re.M)) >= 3
     compile(code(page), name_of(page), "exec")
 

@@ -263,5 +263,5 @@ def test_surfaces_that_cross_are_traced_as_they_stand(triplet, criterion):
 
 def test_compensator_that_moves_nothing_is_refused(triplet):
     rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(5, "tilt_z")])
-    with pytest.raises(rt.BadTolerance, match="it has no effect on the RMS spot radius; leave it out"):
+    with pytest.raises(rt.BadTolerance, match=r"no effect .*; leave it out"):
         rt.tolerance(triplet, rows, trials=0)

@@ -87,7 +87,7 @@ def smooth_power(power):
 
 @pytest.mark.parametrize("model", ["gaussian", "drt", "fourier"])
 def test_a_model_of_rays_is_refused_with_elements(model):
-    with pytest.raises(ValueError, match=f"model '{model}' with phase elements.*expected model 'wave'"):
+    with pytest.raises(ValueError, match=f"'{model}' .*expected model 'wave'"):
         rt.render(slow_gauss(), light(1, 40, 60), sensor=SENSOR, elements=smooth(0.0), model=model)
     with pytest.raises(ValueError, match=f"model '{model}' with phase elements"):
         FieldKernels(slow_gauss(), SENSOR, model, 0, 9, torch.ones(1), torch.ones(1, 1), elements=(smooth(0.0),))

@@ -500,7 +500,7 @@ def test_a_file_brings_environments_back_bit_for_bit(tmp_path, conditions):
 
 
 def test_a_surface_in_an_environment_of_a_lens_without_one_is_not_written(tmp_path):
-    with pytest.raises(rt.LensFileError, match="surface 3: a surface in an environment of its own, of a lens without"):
+    with pytest.raises(rt.LensFileError, match=r"surface 3: .*environment of its own"):
         rt.write_lens(vacuum_cell(), tmp_path / "cell.zmx")
     assert not [*tmp_path.iterdir()]
 
@@ -529,9 +529,9 @@ def test_configurations_have_their_temperatures_and_pressures(tmp_path):
 def test_temperatures_at_which_no_glass_is_one_are_refused_and_extrapolated_ones_reported():
     """The polynomials of third order in T make a focal length of 10⁻²³ mm at 10⁶ °C."""
     lens = rt.read_lens("cooke_triplet")
-    with pytest.raises(ValueError, match=r"temperature=1e\+06.*up to 1000; thermal coefficients .* from -100 to 140"):
+    with pytest.raises(ValueError, match=r"temperature=1e\+06.*up to 1000; .* -100 to 140"):
         lens.at(temperature=1e6)
-    with pytest.warns(NoThermalCoefficients, match="extrapolated to 200 °C; those of catalogs hold from -100 to 140"):
+    with pytest.warns(NoThermalCoefficients, match=r"200 °C; .* -100 to 140"):
         lens.at(temperature=200)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

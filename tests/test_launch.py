@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from problems import PICOMETRE, double_gauss, fields, lens, scalar, surface, vector
+from problems import PICOMETRE, double_gauss, fields, fisheye, lens, scalar, surface, vector
 
 import raytrace as rt
 from raytrace.maths.numerics import to
@@ -37,23 +37,6 @@ def aiming_error(system, rays, points=POINTS):
     """Largest distance at the stop to where the ray was aimed, in stop radii; rays not found left out."""
     found = at_stop(system, rays).position[:2] / stop_radius(system) - points[:, None, None]
     return torch.where(rays.valid, found, 0.0).abs().max().item()
-
-
-def fisheye(**others):
-    """Two negative menisci before a positive group; chief rays from 75° reach the stop, the pupil wanders."""
-    elements = [
-        surface(1 / 80, 4.0, 1.6),
-        surface(1 / 22, 22.0),
-        surface(1 / 150, 3.0, 1.6),
-        surface(1 / 20, 25.0),
-        surface(1 / 40, 8.0, 1.7),
-        surface(-1 / 60, 10.0),
-        surface(None, 4.0),
-        surface(-1 / 100, 3.0, 1.75),
-        surface(1 / 30, 8.0, 1.6),
-        surface(-1 / 25, 40.0),
-    ]
-    return lens(elements, **{"stop": 7, "aperture": ("entrance_pupil_diameter", 2.0), **others})
 
 
 def relay(back: float, distance: float, **others):
@@ -213,7 +196,7 @@ def test_a_lost_marginal_ray_leaves_the_others_aimed():
 
 
 def test_an_unknown_kind_of_aiming_is_refused():
-    with pytest.raises(ValueError, match="ray aiming 'on': expected one of auto, off, paraxial, real"):
+    with pytest.raises(ValueError, match=r"'on': expected .*auto, off, paraxial, real"):
         launch(double_gauss(), CENTRE, ray_aiming="on")
 
 

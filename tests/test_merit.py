@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import SHARED
 
 import raytrace as rt
 from raytrace.optimization.merit import UnknownOperand
 from raytrace.system.optimization_data import OptimizationData, Row
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+DEVELOPMENT = SHARED / "merit" / "dev"
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +163,7 @@ def test_long_tables_share_lines_and_list_every_row_when_asked(lens):
     assert str(rt.Merit.default(lens)).count("TRAC") == 21
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize(
     "name", ["Project_X__sc_schmidt3.ZMX", "Project_X__sc_scan3.ZMX", "Project_X__sc_maksutov2.zmx"]
 )

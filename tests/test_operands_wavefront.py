@@ -2,15 +2,14 @@
 
 import itertools
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from bends import folded
 from differences import slopes_by_differences
+from problems import SHARED, surface, values, vector
 from problems import lens as lens_of
-from problems import surface, values, vector
 
 import raytrace as rt
 from raytrace.optimization.merit import Evaluation
@@ -25,7 +24,7 @@ from raytrace.tracing.scene import scene
 from raytrace.tracing.trace import lens_steps, trace_lens
 from raytrace.tracing.wavefront import path_to_reference_sphere, wavefront_of
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+DEVELOPMENT = SHARED / "merit" / "dev"
 WAVES = 1e-7  # what the oracle is held to
 
 POINTS = [(0.0, 0.0), (0.0, 0.95), (0.5, -0.4), (-0.3, 0.7), (0.8, 0.1), (0.0, -0.6), (0.6, 0.6), (-0.9, 0.2)]
@@ -214,7 +213,7 @@ def test_the_sign_of_a_longer_path():
 
 
 def test_a_reading_that_is_not_known_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': expected one of per wavelength, common"):
+    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': .*per wavelength, common"):
         Conventions(opd_tilt="mine")
 
 
@@ -275,7 +274,7 @@ def test_paths_in_inches():
 def test_a_surface_that_is_not_there_is_named():
     lens = rt.read_lens("cooke_triplet")
     last = len(lens.surfaces) - 1
-    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH names surface 40: this lens has surfaces 0 to {last}"):
+    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH .*surface 40: .*surfaces 0 to {last}"):
         values(lens, [Row("OPTH", (40, 1))])
 
 
@@ -332,7 +331,7 @@ def test_derivatives_of_a_bent_lens():
 # -- oracle ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize("name", ["Apochromat3.zmx", "sc_maksutov2.zmx", "sc_schmidt3.ZMX", "sc_slit.ZMX"])
 def test_stored_designs_agree_with_the_oracle(name):
     """In size: which sign a longer path has is not settled."""

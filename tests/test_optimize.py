@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize
 from scripts import script
 
@@ -344,7 +344,7 @@ def test_errors_of_optimize_are_one_line(words, said, command_line):
 
 
 def test_a_merit_without_weight_and_one_without_light_are_refused(triplet):
-    with pytest.raises(NoProblem, match="no row of the merit function has a weight"):
+    with pytest.raises(NoProblem, match=r"no row .* has a weight"):
         rt.optimize(triplet, merit=[Row("EFFL")], vary="curvature")
     row = Row("TRAC", (0, 1), (0.0, 0.0, 0.0, 40.0), weight=1.0)
     with pytest.raises(NoProblem, match="no ray"):
@@ -363,7 +363,7 @@ def test_the_figure_shows_before_and_after(triplet, tmp_path):
 
 # -- files with a merit function, where they are at hand ---------------------------------------------------------------
 
-FILES = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+FILES = SHARED / "merit" / "dev"
 KNOWN = json.loads((FILES / "oracle.json").read_text())["files"] if (FILES / "oracle.json").exists() else []
 QUICK = ("sc_hamm2", "Schmidt-Cassegrain", "sc_slit", "PyZDDE__Doublet", "sc_cooke2", "AchromaticAt800")
 
@@ -376,6 +376,7 @@ def of_files():
             yield pytest.param(known, marks=marks, id=known["file"])
 
 
+@pytest.mark.needs(FILES)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("known", [*of_files()])
 def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(known):
@@ -439,7 +440,7 @@ def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_opti
 def test_a_row_without_a_derivative_is_refused_with_its_name(triplet):
     """0 · ∞, where a root begins."""
     bad = Row(rt.Measure("bad", lambda lens: 1 + (0 * lens.surfaces[1].curvature).abs().sqrt()), weight=1.0)
-    with pytest.raises(NoProblem, match="row 1 of the merit function, bad, has no derivative by curvature_1"):
+    with pytest.raises(NoProblem, match=r"row 1 .*bad, .*derivative by curvature_1"):
         rt.optimize(triplet, merit=[bad], vary="curvature:1", cycles=1)
 
 

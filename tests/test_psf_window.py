@@ -6,7 +6,7 @@ import pytest
 import torch
 from differences import gradcheck
 from problems import scalar, sharp_double_gauss, vector
-from test_psf_derivatives import moved
+from problems_psf import moved
 
 import raytrace as rt
 from raytrace.maths.sampling import grid
@@ -156,5 +156,5 @@ def test_windows_of_a_lens_with_elements_follow_the_chief_ray():
 
 
 def test_a_window_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match="window 'moving' is not known; expected follows, fixed"):
+    with pytest.raises(ValueError, match=r"'moving' .*follows, fixed"):
         rt.psf(sharp_double_gauss(), "gaussian", window="moving")

@@ -34,9 +34,8 @@ ROWS = [
 
 def test_every_public_name_matches_the_table_after_importing_all_modules():
     """No module may replace a function of the same name: `import raytrace.x` puts x into the package."""
-    without = ("raytrace.bench.peers", "raytrace.__main__")  # these need the extra [bench], or run
     for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
-        if not found.name.startswith(without):
+        if found.name != "raytrace.__main__":  # which runs the command
             importlib.import_module(found.name)
     for name, place in rt.PUBLIC.items():
         module, _, own = place.partition(":")
@@ -66,7 +65,7 @@ def test_eight_threads_call_functions_first_in_a_fresh_process():
 
 def test_a_warning_is_given_once_for_all_lines_that_call():
     for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
-        if not found.name.startswith(("raytrace.bench.peers", "raytrace.__main__")):
+        if found.name != "raytrace.__main__":
             importlib.import_module(found.name)
 
     kinds = [Warning]
@@ -240,7 +239,7 @@ def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
     assert torch.allclose(many.rms_radius, found.rms_radius.double(), rtol=0.01)
     with pytest.raises(ValueError, match="keeps none"):
         many.plot()
-    with pytest.warns(rt.LostRays, match="field 80 degrees, .* all 648 rays lost: missed surface"):
+    with pytest.warns(rt.LostRays, match=r"field 80 degrees, .* 648 rays .*missed surface"):
         rt.spot(lens, fields=[80])
 
 
@@ -550,16 +549,16 @@ def test_analyses_have_gradients_and_report_failed_fields():
     assert slope.isfinite()
     assert str(found)
     assert rt.ray_fan(lens.replace(3, curvature=curvature)).plot().axes
-    with pytest.warns(rt.LostRays, match="no ray of field 80 degrees reaches the sensor"):
+    with pytest.warns(rt.LostRays, match="no ray of field 80 degrees"):
         rt.ray_fan(lens, fields=[0, 80])
-    with pytest.raises(rt.OutOfReach, match="no ray of field 80 degrees reaches the sensor"):
+    with pytest.raises(rt.OutOfReach, match="no ray of field 80 degrees"):
         rt.wavefront(lens, fields=[0, 80])
     with pytest.raises(rt.NothingToShow, match="all fields are on the axis"):
         rt.distortion(lens, fields=[0])
 
 
 def test_errors_speak_of_keywords_from_python_and_of_options_from_the_command(capsys):
-    with pytest.raises(ValueError, match=r"`through_focus` needs one spatial frequency: give `frequencies`"):
+    with pytest.raises(ValueError, match=r"`through_focus` .*give `frequencies`"):
         rt.mtf(rt.read_lens("cooke_triplet"), through_focus=0.1)
     assert main(["mtf", "cooke_triplet", "--through-focus", "0.1"]) == 1
     assert "--through-focus needs one spatial frequency: give --frequency" in capsys.readouterr().err

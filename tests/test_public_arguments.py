@@ -166,9 +166,7 @@ def varied(lens, curvature):
 @pytest.mark.parametrize("function", VMAPPED)
 def test_a_verb_that_reads_numbers_names_itself_under_vmap(function, singlet):
     curvatures = torch.tensor([0.02, 0.021], dtype=torch.float64)
-    with pytest.raises(
-        RuntimeError, match=f"^{function} does not work under torch.func.vmap.* first_order, rays, base_ray"
-    ):
+    with pytest.raises(RuntimeError, match=f"^{function} .*torch.func.vmap.* first_order, rays, base_ray"):
         torch.func.vmap(lambda c: FUNCTIONS[function](varied(singlet, c), **VMAPPED[function]))(curvatures)
 
 

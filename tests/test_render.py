@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from problems import random
 
 import raytrace as rt
 from raytrace.budget import OverBudget, within
@@ -52,10 +53,6 @@ def ready(lens, sensor=FIELD, **options):
         warnings.simplefilter("ignore")
         how = {"model": "gaussian", "wavelengths": lens.wavelengths, "nodes": (3, 4), "order": 4, "tol": 1e-9}
         return optics(lens, sensor, **{**how, **options})  # no low rank
-
-
-def random(*shape, seed=0):
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def direct(picture, kernels, *, boundary="zero"):
@@ -520,7 +517,7 @@ def computed(monkeypatch):
 
 
 def test_a_sensor_far_beyond_the_fields_is_reported_before_the_kernels(triplet, computed):
-    reported = pytest.warns(BeyondFields, match=r"43.3 mm from the axis, 2 times .* take a smaller sensor")
+    reported = pytest.warns(BeyondFields, match=r"43.3 mm .* 2 times .*smaller sensor")
     with reported, computed:
         optics(triplet, rt.Sensor(size=(72, 48), pixels=(240, 160), response="rgb"))
 
@@ -630,7 +627,7 @@ def test_a_lens_of_one_wavelength_has_no_colours(triplet):
 
 
 def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
-    with within(1e8), pytest.raises(OverBudget, match=r"kernels of 399 × 399 pixels at 3 × 3 places.*--tol.*--size"):
+    with within(1e8), pytest.raises(OverBudget, match=r"399 × 399 pixels .*3 × 3.*--tol.*--size"):
         optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
 
 

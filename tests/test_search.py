@@ -336,7 +336,7 @@ def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
 
         set_postfix_str = close = lambda self, *arguments: None
 
-    with pytest.raises(NoProblem, match=r"from 0 starts; the nearest of 4 descents, in .*nearest.zmx: ") as error:
+    with pytest.raises(NoProblem, match=r"0 starts; .* 4 descents, .*nearest.zmx") as error:
         rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, progress=Bar, **HOW)
     assert "it is not at its minimum yet" in str(error.value) or "efl=50 at " in str(error.value)
     nearest = rt.read_lens(tmp_path / "nearest.zmx")
@@ -450,9 +450,7 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
 @pytest.mark.slow
 def test_a_search_without_a_lens_names_what_its_nearest_one_misses(plate):
     """F/5 is not F/3, which no linear model of one point excludes."""
-    with pytest.raises(
-        NoProblem, match=r"from 2 starts; the nearest of \d+ descents: .*working_f_number=3 at"
-    ) as error:
+    with pytest.raises(NoProblem, match=r"2 starts; .*working_f_number=3") as error:
         rt.search(plate, hold="efl=50 working_f_number=3", starts=2, **HOW)
     assert "hold less" in str(error.value)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_training import fit
+from problems_training import fit
 
 import raytrace as rt
 from raytrace import shards

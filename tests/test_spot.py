@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
+from hardcases_scene import of_kind
 from problems import floats, number, vector
-from test_hardcases import of_kind
 
 import raytrace as rt
 from raytrace.cli import main

@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
@@ -191,10 +191,11 @@ def test_compensators_that_the_lens_does_not_have_or_need(triplet):
             rt.tolerance(triplet, dataclasses.replace(rows, compensators=(one,)), trials=0)
 
 
-FILES = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+FILES = SHARED / "tolerance" / "dev"
 
 
 @pytest.mark.slow
+@pytest.mark.needs(FILES)
 @pytest.mark.parametrize("file", sorted(FILES.glob("*.zmx")), ids=lambda file: file.stem)
 def test_tolerances_of_a_file(file):
     """Whatever light is lost: of SC_Tol_RflScp2 decentres may leave the most clipped of five fields in the dark."""
@@ -247,11 +248,11 @@ def test_a_yield_that_is_met_leaves_the_limits(triplet):
 
 
 def test_impossible_goals_are_refused(triplet):
-    with pytest.raises(rt.BadTolerance, match="nominal lens itself does not reach the goal"):
+    with pytest.raises(rt.BadTolerance, match=r"nominal lens .* not reach the goal"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, goal=1.0, yield_=0.9)
     with pytest.raises(ValueError, match="a share of the lenses between 0 and 1"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, yield_=90.0)
-    with pytest.raises(ValueError, match="expected a change of the criterion above 0"):
+    with pytest.raises(ValueError, match=r"expected .* above 0"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.0)
 
 
@@ -275,7 +276,7 @@ PLATE = [{"thickness": 5, "glass": "N-BK7"}, {"thickness": 50}]
 
 def test_a_compensator_without_effect_is_refused():
     plate = rt.lens(PLATE, stop=1, entrance_pupil_diameter=10, fields=[0, 5])
-    with pytest.raises(rt.BadTolerance, match="thickness of surface 2: it does not improve the criterion"):
+    with pytest.raises(rt.BadTolerance, match=r"thickness of surface 2: .*not improve"):
         rt.tolerance(plate, limits="thickness=0.1", trials=0)
 
 
@@ -460,7 +461,7 @@ def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
 
 def test_a_compensator_listed_twice_is_refused(triplet):
     rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(7), rt.Compensator(7)])
-    with pytest.raises(rt.BadTolerance, match="two of them do the same to the criterion; leave one out"):
+    with pytest.raises(rt.BadTolerance, match=r"two of them .*leave one out"):
         rt.tolerance(triplet, rows, trials=0)
 
 

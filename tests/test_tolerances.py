@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import number
+from problems import SHARED, number
 
 import raytrace as rt
 from raytrace.materials.environment import Environment, index_in
@@ -836,12 +836,12 @@ def test_a_file_without_tolerances_is_refused(tmp_path):
         rt.read_tolerances(with_lines(tmp_path, ""))
 
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+DEVELOPMENT = SHARED / "tolerance" / "dev"
 #: Rows of each file, with an angle for each irregularity.
 REAL = {"SC_Tol_Cooke": 47, "SC_Tol_singlet2": 11, "sc_tol_DblPass3": 17, "sc_tol_scan1": 26, "ASL10142-1064": 9}
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize("name", REAL)
 def test_files_of_others_are_read_and_their_lenses_made(name):
     path = DEVELOPMENT / f"{name}.zmx"
@@ -863,7 +863,7 @@ def test_files_of_others_are_read_and_their_lenses_made(name):
         close(ends[0].position[:, 1], ends[1].position, 1e-12)
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 def test_errors_of_a_lens_in_double_pass_are_in_both_passes():
     path = DEVELOPMENT / "sc_tol_DblPass3.zmx"
     lens, found = rt.read_lens(path), rt.read_tolerances(path)
@@ -888,7 +888,7 @@ def test_errors_of_a_lens_in_double_pass_are_in_both_passes():
     assert [float(s[k].before.x) for k in (2, 10)] == pytest.approx([0.05, 0.05])
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 def test_an_error_of_an_operand_is_in_its_configuration_alone():
     path = DEVELOPMENT / "sc_tol_scan1.zmx"
     lens, found = rt.read_lens(path), rt.read_tolerances(path)

@@ -261,11 +261,11 @@ def test_a_medium_of_few_numbers_keeps_its_formula(formula):
 
 def test_a_dispersion_that_no_formula_comes_near_is_refused(tmp_path):
     near = sellmeier([1.3, 0.002], [0.01, 0.15], "POLE")  # a resonance at 0.39 µm
-    with pytest.raises(NoMelt, match=r"POLE with index errors has no melt from 0.4 to 0.7 µm: a formula differs by"):
+    with pytest.raises(NoMelt, match=r"POLE .* no melt from 0.4 to 0.7 µm"):
         melt(with_index_errors(near, number(1e-3)), vector(0.4, 0.7))
     lens = rt.read_lens("singlet").replace(1, glass=near).at(wavelengths=[0.4, 0.7])
     lens = rt.perturbed(lens, [rt.Tolerance("index", (1,), -1, 1)], [1e-3])
-    with pytest.raises(LensFileError, match=r"surface 1: POLE with index errors has no melt"):
+    with pytest.raises(LensFileError, match=r"surface 1: POLE .* no melt"):
         rt.write_lens(lens, tmp_path / "lens.zmx")
 
 
@@ -314,7 +314,7 @@ def test_a_catalog_of_others_is_not_replaced(tmp_path):
     other = tmp_path / "lens-melts.agf"
     text = "CC my glasses\nNM MINE 2 500500 1.5 50 0 0 -1\nCD 1 0.01 0 0 0 0 0 0 0 0\nLD 0.3 2\n"
     other.write_text(text)
-    with pytest.raises(LensFileError, match=r"lens-melts.agf .* another one of that name; give the lens another name"):
+    with pytest.raises(LensFileError, match=r"lens-melts.agf .*give the lens another name"):
         rt.write_lens(made, tmp_path / "lens.zmx")
     assert [p.name for p in tmp_path.iterdir()] == ["lens-melts.agf"]
     assert other.read_text() == text
@@ -383,7 +383,7 @@ def test_a_trial_is_the_lens_whose_criterion_the_study_has(study):
         assert lens.optimization_data.variables == lens.optimization_data.solves == ()
         assert lens.notes[-1] == f"As built: trial {k} of seed 0, RMS spot radius {float(study.trials[k]):.6g} µm"
     for k in (-1, 40):
-        with pytest.raises(ValueError, match=f"trial {k}: expected 0 to 39, as 40 were traced"):
+        with pytest.raises(ValueError, match=f"trial {k}: expected 0 to 39"):
             study.trial(k)
 
 

@@ -89,7 +89,7 @@ def test_the_image_of_a_tilted_lens_follows_scheimpflug():
 
 def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
     """It has the same index, dispersion and partial dispersion, and one warning for each surface says so."""
-    with pytest.warns(VariedGlass, match="varies as a model glass, whose index is off by") as said:
+    with pytest.warns(VariedGlass, match=r"model glass, .* off by") as said:
         found = design_variables(lens, "index abbe_number:3")
     assert len(said) == len(found.variables) - 1 == 6
     model = DesignVariables(found.lens, found.variables)

@@ -164,7 +164,7 @@ def test_a_state_is_of_the_prescription_under_any_conditions_and_in_any_precisio
 def test_a_state_of_an_older_version_is_refused_with_the_way_to_load_it():
     variables = Variables(LENS, "sensor")
     state = {"sensor": torch.tensor(0.25, dtype=torch.float64)}
-    with pytest.raises(OtherLens, match=r"an older version wrote it\. .* set state\['_extra_state'\]"):
+    with pytest.raises(OtherLens, match=r"older version.* set state\['_extra_state'\]"):
         variables.load_state_dict(state)
     variables.load_state_dict(state | {"_extra_state": variables.get_extra_state()})
     assert float(variables.sensor) == 0.25
@@ -201,7 +201,7 @@ def test_bounds_hold_after_a_step():
     numbers = variables.numbers()
     assert numbers["sensor"] == pytest.approx(58.0, abs=NANOMETRE)
     assert numbers["curvature_3"] == pytest.approx(0.0, abs=1e-12)
-    with pytest.raises(BadVariables, match="`bounds` for thickness_2, not among the variables"):
+    with pytest.raises(BadVariables, match="`bounds` for thickness_2, not among"):
         Variables(read_lens("double_gauss"), "sensor", bounds={"thickness_2": (0, 1)})
 
 

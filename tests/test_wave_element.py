@@ -337,7 +337,7 @@ def test_wrong_arrays_are_refused(numbers, options, message):
 
 
 def test_an_array_alone_is_no_element():
-    with pytest.raises(TypeError, match=r"an? ndarray is no phase element; expected .*rt\.element\(heights"):
+    with pytest.raises(TypeError, match=r"ndarray .*expected .*rt\.element\(heights"):
         rt.wave_psf(np.zeros((9, 9)))
     with pytest.raises(TypeError, match=r"`elements` is 'cubic'; expected .*rt\.elements"):
         rt.hybrid_psf("double_gauss", "cubic")
@@ -345,12 +345,12 @@ def test_an_array_alone_is_no_element():
 
 @pytest.mark.parametrize("function", [rt.elements, rt.read_element])
 def test_an_array_in_place_of_a_file_is_refused_with_the_function_that_takes_it(function):
-    with pytest.raises(TypeError, match=r"a ndarray; expected a path or a text; an array of heights: rt\.element\("):
+    with pytest.raises(TypeError, match=r"ndarray; expected a path .*rt\.element\("):
         function(np.zeros((4, 4)), aperture=1.0)
 
 
 @pytest.mark.parametrize("option", [{"levels": 8}, {"aperture": 3.0}, {"glass": "PMMA"}, {"design_wavelength": 0.5}])
 def test_options_of_a_name_are_refused_for_an_element(option):
     (element,) = rt.elements("singlet", aperture=2.0)
-    with pytest.raises(ValueError, match=f"`{next(iter(option))}` belongs to an element by name or from a file"):
+    with pytest.raises(ValueError, match=f"`{next(iter(option))}` .*by name or from a file"):
         rt.wave_psf(element, **option)

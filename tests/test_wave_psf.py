@@ -7,7 +7,7 @@ import pytest
 import torch
 from differences import gradcheck
 from problems import scalar, vector
-from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
+from problems_waves import PLASTIC, R, Z, lens, relative, scene
 
 import raytrace as rt
 from raytrace.materials.catalogs import find_glass

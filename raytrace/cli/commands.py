@@ -46,7 +46,6 @@ from raytrace.cli.types import (
     lens_file,
     many,
     not_negative,
-    output_file,
     picture_or_folder,
     positive,
     positive_finite,
@@ -518,34 +517,27 @@ interpolated. -o names a file, or a folder for several pictures, which share the
     _command(
         "bench",
         "measure speed against error",
-        "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
-        "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
-        "with gradients, aspheres and the step of the sensor distance (minutes); or Cooke triplets perturbed and "
-        "refocused; or pictures rendered through one, and steps of training. With the extra [bench] Optiland and "
-        "ray-optics are measured, too.",
+        "Measure on this machine, for lenses of your own: the trace, forward and with gradient, in float32 and float64 "
+        "(trace); every PSF model at every sampling against converged kernels, on the axis and at the largest field "
+        "(psf, minutes); or a training step of a camera and pictures of 12 megapixels against direct superposition "
+        "(camera, minutes).",
         """
         trace
-        psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
-        trace --rays 1000 100000 -o bench.md --plot bench.png
-        speed --quick --repeats 1
-        tolerance --json
-        camera -o camera.md --plot camera.png""",
-        Option("what", help="subject of the measurement", flag="what",
-            choices=("trace", "psf", "speed", "tolerance", "camera")),
-        Option("lenses", file_name, "LENS", "psf: lenses to measure, on the axis and at the largest field "
-            "(default double_gauss phone hubble, in predefined conditions)", flag="lenses", nargs="*"),
+        trace tessar --rays 1000 100000 -o trace.csv --plot trace.png
+        psf double_gauss phone -o psf.csv --plot psf.png
+        camera double_gauss --sensor 36x24 --json""",
+        Option("what", help="subject of the measurement", flag="what", choices=("trace", "psf", "camera")),
+        Option("lenses", file_name, "LENS", "one lens, of psf any number (default: trace double_gauss, psf "
+            "double_gauss phone, camera cooke_triplet)", flag="lenses", nargs="*"),
         "json",
-        Option("lens", None, "LENS", "trace: lens to trace (default double_gauss)"),
         Option("rays", count, "N", "trace: numbers of rays (default 1000 10000 100000 1000000)", nargs="+"),
         Option("device", None, "NAME", "trace: device to trace on as well, such as cuda"),
+        Option("sensor", extent, "WxH", "camera: width and height in mm, as 24x16 (default: the largest field of the "
+            "lens in the corners)"),
         Option("repeats", count, "N", "runs, whose median is reported", default=5),
         Option("threads", count, "N", "threads of torch"),
-        switch("no_peers", "leave out Optiland even if it is installed"),
-        output("report to write (.md)", file_of(".md")),
-        Option("csv", output_file, "FILE", "psf: table to write, one line for each measurement"),
-        Option("docs", folder_name, "DOCS", "speed: folder for speed.md, speed.csv and speed.png"),
-        switch("quick", "speed: few rays, as a trial; the ratios are not meaningful"),
-        plot("speed over number of rays, or time over error,"),
+        TABLE,
+        plot("speed over number of rays (trace), or time over error (psf),"),
         "max_bytes", run="bench.command:run",
     ),
     _command(
