@@ -42,9 +42,11 @@ _KINDS: dict[Any, str] = {
     **{float: "a number", Sequence: "a sequence", Iterable: "a sequence", tuple: "a pair", Callable: "a function"},
 }
 #: Values that functions make, by the name of their class: how to make one.
-_MADE = {"Element": "an Element of rt.elements (a name, a file) or rt.element (an array)"}
+_MADE = {
+    "Element": "an Element of rt.wave_optics.phase_elements (a name, a file) or rt.wave_optics.phase_element (an array)"
+}
 #: Of an array where the name or the file of an element is expected.
-_OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=…, aperture=…, glass=…)"
+_OF_HEIGHTS = "; an array of heights: rt.wave_optics.phase_element(heights, pitch=…, aperture=…, glass=…)"
 
 
 @functools.cache

@@ -349,7 +349,7 @@ def test_a_state_of_an_older_version_loads(triplet):
 
 def test_optics_and_network_have_rates_of_their_own(triplet):
     one = made(triplet)
-    one.network = rt.UNet(channels=3, levels=1, width=4)
+    one.network = rt.imaging.UNet(channels=3, levels=1, width=4)
     optimizer = torch.optim.SGD(one.rates(optics=1e-3, network=1e-1))
     assert [group["lr"] for group in optimizer.param_groups] == [1e-3, 1e-1]
     assert sum(len(group["params"]) for group in optimizer.param_groups) == len([*one.parameters()])

@@ -104,7 +104,7 @@ OTHERS = {
     "another lens: .* thickness 12.93 of surface 2, not 13": (TRIPLET.replace(2, thickness=13.0), {}),
     "other conditions": (TRIPLET.at(fields=[0.0, 7.0]), {}),
     "other variables: .*; expected thickness_1 among them": (TRIPLET, {"vary": "curvature:1-4 sensor thickness:1"}),
-    "other merit": (TRIPLET, {"merit": rt.DefaultMerit("spot", rings=4)}),
+    "other merit": (TRIPLET, {"merit": rt.optimization.DefaultMerit("spot", rings=4)}),
     "other hold": (TRIPLET, {"hold": "efl=100"}),
     "other paths": (TRIPLET, {"paths": 2}),
     "other bounds": (TRIPLET, {"bounds": "sensor:70..90"}),

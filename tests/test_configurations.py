@@ -65,7 +65,7 @@ def test_a_scanning_mirror_turns_the_light_by_twice_its_angle_and_its_pickup_tur
     assert (operand.name, operand.number, operand.parameter) == ("PRAM", 3, 3)
     assert [(place.path[1], place.factor) for place in operand.paths] == [(3, 1.0), (5, -1.0)]
     for angle, one in zip(ANGLES, lens.configurations, strict=True):
-        end = rt.trace(one, rt.rays(one, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+        end = rt.trace(one, rt.tracing.rays(one, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
         height = 80 * torch.tan(torch.deg2rad(torch.tensor(2 * angle, dtype=torch.float64)))
         assert abs(abs(float(end.position[1])) - abs(float(height))) < 1e-12
     for active in (2, 3, 5):  # whichever was current when it was saved

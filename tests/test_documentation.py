@@ -65,5 +65,7 @@ def test_the_caption_of_a_single_kernel_stays_on_its_page():
 
     import raytrace
 
-    found = raytrace.wave_psf("singlet", depths=[500], wavelengths=[0.46], size=8, engine="pupil", samples=600)
+    found = raytrace.wave_optics.wave_psf(
+        "singlet", depths=[500], wavelengths=[0.46], size=8, engine="pupil", samples=600
+    )
     assert not outside(found.plot())

@@ -167,7 +167,7 @@ def doublet_at_100_degrees():
 
 def image_radius(lens):
     rim = torch.tensor([[0.0, 0.0], [1.0, -1.0]], dtype=torch.float64)
-    return rt.trace(lens, rt.rays(lens, pupil=rim)).position[:2].norm(dim=0).max().item()
+    return rt.trace(lens, rt.tracing.rays(lens, pupil=rim)).position[:2].norm(dim=0).max().item()
 
 
 def test_doublet_meets_the_radius_that_opticstudio_stored_at_100_degrees():
@@ -194,7 +194,7 @@ def test_vacuum_in_a_cell_is_thinner_than_the_air_around_it():
     assert media(lens, lens.wavelengths)[3].item() == pytest.approx(1 / 1.00027308, abs=1e-8)
     assert first_order(lens).paraxial_image_distance.item() == pytest.approx(63.25768502176, abs=1e-11)
     rim = torch.tensor([[0.0, 0.0], [1.0, -1.0]], dtype=torch.float64)
-    height = rt.trace(lens, rt.rays(lens, pupil=rim)).position[1].abs().max().item()
+    height = rt.trace(lens, rt.tracing.rays(lens, pupil=rim)).position[1].abs().max().item()
     assert height == pytest.approx(21.2820365547, abs=4e-8)
     in_vacuum = lens.at(pressure=0.0)  # all of it: the windows are as they were, the gaps as their surroundings
     assert media(in_vacuum, lens.wavelengths)[3].item() == 1.0
@@ -238,16 +238,16 @@ def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
 
     def spread(celsius, pressure):
         found = lens.at(temperature=celsius, pressure=pressure)
-        rays = rt.rays(found, fields=[0, 10], pupil=rt.gauss_rings(4))
+        rays = rt.tracing.rays(found, fields=[0, 10], pupil=rt.maths.gauss_rings(4))
         traced = trace_lens(found, rays, found.wavelengths[:, None])
-        return spot_of(traced, rt.gauss_rings(4)[1]).mean_square_radius
+        return spot_of(traced, rt.maths.gauss_rings(4)[1]).mean_square_radius
 
-    with rt.trace_engine(engine):
+    with rt.tracing.trace_engine(engine):
         given = (float64(35.0, requires_grad=True), float64(0.6, requires_grad=True))
         # 1e-6 a degree: steps of a hundredth of a degree and of an atmosphere are far above rounding.
         assert gradcheck(spread, given, eps=1e-2, atol=1e-9, rtol=1e-4)
         found = torch.autograd.grad(spread(*given).sum(), given)
-    with rt.trace_engine("eager"):
+    with rt.tracing.trace_engine("eager"):
         expected = torch.autograd.grad(spread(*given).sum(), given)
     assert torch.allclose(torch.stack(found), torch.stack(expected), rtol=1e-9)
 

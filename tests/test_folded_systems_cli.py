@@ -43,7 +43,7 @@ def test_a_refusal_names_the_surface_and_the_alternatives(run, tmp_path, argv, s
 
 
 def test_kinds_in_words():
-    assert named(rt.IdealLens(0.1, 0.1)) == "an ideal lens"
+    assert named(rt.system.IdealLens(0.1, 0.1)) == "an ideal lens"
     assert with_article("biconic") == "a biconic"
 
 
@@ -79,7 +79,7 @@ def test_a_parallel_beam_has_encircled_energy(tmp_path):
 
 def test_models_are_compared_where_a_surface_is_curved():
     ideal = rt.lens(
-        [dict(thickness=50.0, phase=rt.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
+        [dict(thickness=50.0, phase=rt.system.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
     )
     with pytest.raises(ValueError, match=r"no surface .* is curved; ask for kernels"):
         abilities(ideal)

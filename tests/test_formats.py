@@ -379,10 +379,10 @@ FEATURES = {
         (featured(kind="toroidal", coefficients=vector(0.01)), "refused"),
         (featured(kind="biconic", coefficients=vector(0.01, 0.0)), "refused"),
     ],
-    "tilts and decentres": [(featured(before=rt.Pose(tilt_x=number(3.0))), "refused")],
+    "tilts and decentres": [(featured(before=rt.system.Pose(tilt_x=number(3.0))), "refused")],
     "gratings, holograms, phases": [
-        (featured(phase=rt.Grating(number(0.1), number(1.0))), "refused|powers"),
-        (featured(phase=rt.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
+        (featured(phase=rt.system.Grating(number(0.1), number(1.0))), "refused|powers"),
+        (featured(phase=rt.system.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
     ],
     "apertures and obscurations": [
         (featured(apertures=(Aperture("rectangular", (4.0, 3.0)),)), "refused"),

@@ -383,7 +383,7 @@ def test_every_field_of_a_tilted_object_is_a_point_of_an_untilted_one(ray_aiming
     spots, shape = rt.spot(tilted), rt.spot(system.at(object_distance=150 - z, fields=[y]))
     assert spots.rms_radius.item() == pytest.approx(shape.rms_radius.item(), rel=1e-9)
     assert spots.centroid[1].item() == pytest.approx(shape.centroid[1].item(), rel=1e-9)
-    merit = rt.Merit([rt.Row("RSCE", (8, 1), (0, 1.0), weight=1)])
+    merit = rt.Merit([rt.system.Row("RSCE", (8, 1), (0, 1.0), weight=1)])
     assert rt.evaluate(tilted, merit=merit).values.item() == pytest.approx(spots.rms_radius.item(), rel=1e-5)
     batch = rt.spot(system.replace(0, tilt_x=vector(0.0, 30.0))).rms_radius.flatten().tolist()
     assert batch == pytest.approx([rt.spot(lens).rms_radius.item() for lens in (system, tilted)], rel=1e-12)

@@ -78,7 +78,7 @@ def test_a_file_holds_an_equality_as_a_row_of_negative_weight(tmp_path):
     """The constraint of `hold` in a file: met exactly in the optimisation that stores it and in that of its file."""
     lens, path = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial"), tmp_path / "held.zmx"
     spot = rt.Merit.default(lens, "spot", rings=2)
-    merit = rt.Merit([*spot.rows, rt.Row("EFFL", target=100.0, weight=-1.0)])
+    merit = rt.Merit([*spot.rows, rt.system.Row("EFFL", target=100.0, weight=-1.0)])
     first = rt.optimize(lens, merit=merit, vary="curvature sensor", cycles=6)
     first.save(path)
     again = rt.optimize(path, vary="thickness:2,6 curvature:1-4 sensor", cycles=6)

@@ -330,7 +330,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     """Its row has a name in every result; in a lens file a text replaces it, with a warning."""
     lens = rt.read_lens("cooke_triplet")
     found = rt.optimize(
-        lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=2
+        lens, merit=[rt.system.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.system.Vary(6, "thickness")], cycles=2
     )
     assert found.merit_after < 0.999 * found.merit_before
     document = json.loads(json.dumps(found.document()))["operands"][0]

@@ -37,7 +37,7 @@ def rows(operand: str, *, wavelengths=(1, 2, 3), fields=FIELDS, points=POINTS) -
     return [Row(operand, (0, w), (*h, *p), weight=0.5 + 0.1 * (k % 7)) for k, (w, h, p) in enumerate(asked)]
 
 
-def beam(lens: rt.Lens, w: int, field, points) -> tuple[rt.Rays, torch.Tensor, torch.Tensor]:
+def beam(lens: rt.Lens, w: int, field, points) -> tuple[rt.system.Rays, torch.Tensor, torch.Tensor]:
     """Rays on the image of one wavelength and field (part of the largest), the index there and the wavelength."""
     largest = torch.hypot(lens.fields.x, lens.fields.y).max()
     at, wavelength = largest * vector(*field)[:, None], lens.wavelengths[w]
@@ -245,7 +245,7 @@ def paths_between_hits(lens: rt.Lens, w: int, field, point) -> tuple[list[float]
 def test_paths_are_sums_of_index_times_distance(name, distance):
     lens = rt.read_lens(name)
     if np.isfinite(distance):
-        lens = rt.with_object_distance(lens, torch.tensor(distance).double())
+        lens = rt.system.with_object_distance(lens, torch.tensor(distance).double())
     last, w = len(lens.surfaces) - 1, len(lens.wavelengths) - 1
     numbers = (0.3, 0.5, 0.4, -0.6)
     legs, first = paths_between_hits(lens, w, numbers[:2], numbers[2:])
@@ -308,7 +308,7 @@ def test_derivatives_with_failed_rays(operand, conventions):
 
 def test_derivatives_of_a_path_from_an_object_that_moves():
     """The launch moves with the object, the entrance pupil and the focal length."""
-    lens = rt.with_object_distance(rt.read_lens("cooke_triplet"), torch.tensor(300.0).double())
+    lens = rt.system.with_object_distance(rt.read_lens("cooke_triplet"), torch.tensor(300.0).double())
     model = DesignVariables(lens, (Vary(0, "thickness"), Vary(1, "curvature"), Vary(2, "thickness")))
     numbers = (0.3, 0.5, 0.4, -0.6)
     asked = [Row("OPTH", (s, 3), numbers, weight=1.0) for s in (1, 3, 7)] + [Row("OPDC", (0, 1), numbers, weight=1.0)]

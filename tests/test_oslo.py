@@ -224,7 +224,7 @@ def test_the_first_wavelength_is_the_primary_one():
     """OSLO's chief ray of 14°, mm: of the F line where that is the first wavelength."""
     for waves, height in (("0.48613 0.58756 0.65627", 24.945679), ("0.58756 0.48613 0.65627", 24.9495)):
         found = FORMATS[".len"].read(double_gauss(f"WV {waves}; WW 1 1 1"), "lens.len")[0].at(ray_aiming="real")
-        rays = rt.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
+        rays = rt.tracing.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
         end = rt.trace(found, rays)
         digits = len(str(height).partition(".")[2])
         assert round(float(end.position[1].flatten()[found.primary_wavelength - 1]), digits) == pytest.approx(
@@ -329,7 +329,7 @@ def test_a_mirror_that_bends_the_axis():
     """Optiland's tests: behind a mirror of TLA 45 with BEN, TH -10 leads to 0, -10, 0, and the ray with it."""
     found = lens((FAR, "RFH; TLA 45; BEN; TH -10"), "EBR 1")
     assert frames(found)[2].origin.tolist() == pytest.approx([0, -10, 0], abs=1e-14)
-    end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+    end = rt.trace(found, rt.tracing.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
     assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-14)
     assert end.direction.flatten().abs().tolist() == pytest.approx([0, 0, 1], abs=1e-14)
 
@@ -371,7 +371,7 @@ def test_the_pentaprism_of_the_user_guide():
         corner = leaving.origin - entrance.origin
         assert abs(float(corner @ entrance.axes[:, 2])) == pytest.approx(1, abs=1e-5)
         assert abs(float(corner @ leaving.axes[:, 2])) == pytest.approx(1, abs=1e-5)
-        end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+        end = rt.trace(found, rt.tracing.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
         if not tilt:
             assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-5)
 

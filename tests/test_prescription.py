@@ -84,8 +84,8 @@ def test_a_typed_row_takes_the_numbers_of_its_poses():
     rows = [dict(radius=50, thickness=5, glass="N-BK7", **posed), dict(radius=-60, thickness=70)]
     lens = rt.lens(rows, stop=1, f_number=9, fields=[0, 2])
     number = partial(torch.tensor, dtype=torch.float64)
-    before = rt.Pose(x=number(0.2), y=number(-0.3), tilt_x=tilt, tilt_z=number(20.0), tilts_first=True)
-    after = rt.Pose(y=number(0.3), tilt_x=number(-1.5))
+    before = rt.system.Pose(x=number(0.2), y=number(-0.3), tilt_x=tilt, tilt_z=number(20.0), tilts_first=True)
+    after = rt.system.Pose(y=number(0.3), tilt_x=number(-1.5))
     plain = rt.lens(
         [{k: v for k, v in row.items() if k not in posed} for row in rows], stop=1, f_number=9, fields=[0, 2]
     )
@@ -102,7 +102,7 @@ def test_a_typed_row_takes_the_numbers_of_its_poses():
 def test_impossible_poses_of_a_typed_row_are_refused():
     row = dict(radius=50, thickness=5)
     with pytest.raises(rt.BadPrescription, match=r"surface 1: .*before and tilt_x .*leave one out"):
-        rt.lens([row | dict(before=rt.Pose(), tilt_x=2)], stop=1, f_number=9)
+        rt.lens([row | dict(before=rt.system.Pose(), tilt_x=2)], stop=1, f_number=9)
     with pytest.raises(rt.BadPrescription, match=r"surface 1 .*'tiltx'; did you mean tilt_x"):
         rt.lens([row | dict(tiltx=2)], stop=1, f_number=9)
     with pytest.raises(rt.BadPrescription, match="'steep' is not a number"):

@@ -134,7 +134,7 @@ def test_a_window_on_the_axis_of_a_round_lens_is_a_constant():
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     lens = lens.replace(3, curvature=curvature)
     for center in ("chief", "centroid"):
-        centre = rt.psf(lens, rt.Gaussian(order=2), fields=[0], center=center).grid.centre
+        centre = rt.psf(lens, rt.psf_models.Gaussian(order=2), fields=[0], center=center).grid.centre
         assert not centre.requires_grad
         assert bool((centre == 0).all())
     view = scene(lens, vector(0.0, 0.0, 0.0, 3.0).reshape(2, 2), vector(1e4), vector(0.53))

@@ -64,14 +64,14 @@ def test_means_without_limits_are_exact_and_those_within_are_of_many_draws():
 
 
 def held(lens, limits):
-    return rt.tolerances(lens, limits, compensators=[rt.Compensator(7, minimum=-0.1, maximum=0.1)])
+    return rt.tolerances(lens, limits, compensators=[rt.system.Compensator(7, minimum=-0.1, maximum=0.1)])
 
 
 @pytest.mark.slow
 def test_expectation_within_limits_of_the_sensor_is_the_mean_of_the_trials(focused_triplet):
     rows = held(focused_triplet, "radius=0.1% air=0.05 element_decenter=0.05")
     found = rt.tolerance(focused_triplet, rows, trials=400, seed=7)
-    free = rt.tolerance(focused_triplet, dataclasses.replace(rows, compensators=(rt.Compensator(7),)), trials=0)
+    free = rt.tolerance(focused_triplet, dataclasses.replace(rows, compensators=(rt.system.Compensator(7),)), trials=0)
     assert found.at_limit(0) > 100
     assert float(found.expected) > 1.05 * float(free.expected)  # limits that the expectation feels
     error = float(found.trials.std()) / len(found.trials) ** 0.5

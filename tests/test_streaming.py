@@ -355,9 +355,9 @@ def test_a_spot_that_no_ray_reaches_makes_the_mean_nan_and_no_derivative():
 def test_the_public_gradient_takes_plain_numbers():
     curvatures = [s.curvature.clone().requires_grad_() for s in double_gauss().surfaces if s.curvature is not None]
     system = bent(curvatures, scalar(1.0))
-    plain = rt.mean_square_gradient(system, curvatures, 300, fields=[0, 7.0], wavelengths=[0.55])
+    plain = rt.tracing.mean_square_gradient(system, curvatures, 300, fields=[0, 7.0], wavelengths=[0.55])
     given = vector(0.0, 0.0, 0.0, 7.0).reshape(2, 2), vector(0.55)
-    tensors = rt.mean_square_gradient(system, curvatures, 300, fields=given[0], wavelengths=given[1])
+    tensors = rt.tracing.mean_square_gradient(system, curvatures, 300, fields=given[0], wavelengths=given[1])
     assert plain[0] == tensors[0]
     assert plain[1] == tensors[1]
 

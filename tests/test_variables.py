@@ -425,7 +425,7 @@ def test_variable_syntax_is_that_of_optimize():
 
 def test_variables_and_words_may_be_given_together():
     lens = rt.read_lens("cooke_triplet")
-    free = design_variables(lens, [rt.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
+    free = design_variables(lens, [rt.system.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
     assert [(one.surface, one.quantity) for one in free.variables] == [(1, "curvature"), (3, "conic"), (2, "thickness")]
     assert free.variables[0].bounds == (0.01, 0.05)
     assert float(free.lens.surfaces[3].conic) == 0

@@ -49,7 +49,7 @@ def test_optimisation_data_of_every_real_file_round_trip(path, tmp_path):
     assert again(found, tmp_path).optimization_data == original.optimization_data
 
 
-def of_oracle(name: str, number: str, surface: rt.Surface) -> tuple[int, str]:
+def of_oracle(name: str, number: str, surface: rt.system.Surface) -> tuple[int, str]:
     """Surface and name of a variable of the oracle, which writes p:2/4 for parameter 4 of surface 2."""
     if name != "p":
         return int(number), name
@@ -236,7 +236,7 @@ def test_optimisation_data_stay_with_the_lens_under_other_conditions():
 
 
 def test_one_number_of_the_file_that_is_two_of_the_lens_varies_both(tmp_path):
-    original = lens(surface="TYPE PARAXIAL\nCURV 0\nPARM 1 50\nVPAR 1\nPARM 2 1").replace(1, glass=rt.AIR)
+    original = lens(surface="TYPE PARAXIAL\nCURV 0\nPARM 1 50\nVPAR 1\nPARM 2 1").replace(1, glass=rt.materials.AIR)
     assert original.optimization_data.variables == (Vary(1, "power_x"),)
     assert original.optimization_data.solves == (Solve(1, "power_y", "pickup", source=1, quantity_of_source="power_x"),)
     assert again(original, tmp_path).optimization_data == original.optimization_data

@@ -155,18 +155,21 @@ def test_damaged_files_of_every_type_give_a_lens_or_a_clear_error(examples):
     [
         ({"coefficients": number([1e-9] * 9), "kind": "odd asphere"}, "ODDASPHE has 8"),
         (
-            {"coefficients": number([1e-9]), "phase": rt.Grating(number(0.1), number(1.0))},
+            {"coefficients": number([1e-9]), "phase": rt.system.Grating(number(0.1), number(1.0))},
             "a DGRATING surface has none",
         ),
-        ({"curvature": number(0.1), "phase": rt.IdealLens(number(0.1), number(0.1))}, "a PARAXIAL surface has none"),
-        ({"is_break": True, "glass": rt.MIRROR}, "holds none of them"),
-        ({"before": rt.Pose(x=number([1.0, 2.0]))}, "a file holds one lens"),
-        ({"before": rt.Pose(tilt_x=number(math.nan))}, "tilt or decentre is nan"),
+        (
+            {"curvature": number(0.1), "phase": rt.system.IdealLens(number(0.1), number(0.1))},
+            "a PARAXIAL surface has none",
+        ),
+        ({"is_break": True, "glass": rt.materials.MIRROR}, "holds none of them"),
+        ({"before": rt.system.Pose(x=number([1.0, 2.0]))}, "a file holds one lens"),
+        ({"before": rt.system.Pose(tilt_x=number(math.nan))}, "tilt or decentre is nan"),
     ],
 )
 def test_lenses_that_a_file_cannot_hold_are_refused(changes, message):
     lens = read(text("standard"))[0]
-    bare = dataclasses.replace(lens.surfaces[2], curvature=None, conic=None, glass=rt.AIR)
+    bare = dataclasses.replace(lens.surfaces[2], curvature=None, conic=None, glass=rt.materials.AIR)
     surface = dataclasses.replace(bare, **changes)
     with pytest.raises(LensFileError, match=message) as caught:
         zemax_write.write(

@@ -1,4 +1,4 @@
-"""Options that the subcommands of `raytrace wave` share, of the parameters of `rt.wave_psf`. No torch."""
+"""Options that the subcommands of `raytrace wave` share, of the parameters of `rt.wave_optics.wave_psf`. No torch."""
 
 import dataclasses
 

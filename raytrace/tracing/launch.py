@@ -83,7 +83,7 @@ def rays(
     if pupil is None:
         pupil = gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device)
     points = pupil[0] if isinstance(pupil, (tuple, list)) and pupil else pupil
-    expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.gauss_rings(6)"
+    expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.maths.gauss_rings(6)"
     if not isinstance(points, Tensor):
         raise TypeError(f"rays: `pupil` is {named_value(pupil)}; {expected}")
     if points.dim() != 2 or len(points) != 2:

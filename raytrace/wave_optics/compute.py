@@ -258,8 +258,8 @@ def wave_psf(
 ) -> ElementPsf:
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
-    element, and all up to catalog: as for `rt.elements`; or an Element (`rt.element` makes one of an array), or several
-    in contact, in whose numbers the kernels are differentiable; of the options up to catalog they use `sensor` (mm from
+    element, and all up to catalog: as for `rt.wave_optics.phase_elements`; or an Element (of an array by
+    `rt.wave_optics.phase_element`), or several in contact, in whose numbers the kernels are differentiable; of the options up to catalog they use `sensor` (mm from
     the element) and `exact` alone. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window
     around the axis; with an even size the axis is a corner of four pixels. A kernel holds the light in each pixel, 1 is
     all light through the aperture.
@@ -333,7 +333,7 @@ def phase_elements(
     """The elements in contact of a name, or of a file of heights.
 
     Names: ideal, singlet, fresnel, multifocal, multifocal-refractive, cubic, cubic-refractive, achromat, hybrid; cubic
-    and hybrid are two elements, a lens and a plate. `rt.element` makes an element of an array.
+    and hybrid are two elements, a lens and a plate. `rt.wave_optics.phase_element` makes an element of an array.
 
     aperture: diameter, mm. Of a named element sensor, focus: mm, the distances of its design; design_wavelength: µm,
     0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file as for `read_element`; index:

@@ -227,8 +227,8 @@ def in_contact(elements: Element | Sequence[Element]) -> tuple[Element, ...]:
         wrong = next(part for part in parts if not isinstance(part, Element))
         kind = with_article(type(wrong if isinstance(elements, tuple | list) else elements).__name__)
         raise TypeError(
-            f"{kind} is no phase element; expected an Element or several: rt.elements(name or file) or, of an array "
-            "of heights, rt.element(heights, pitch=…, aperture=…, glass=…)"
+            f"{kind} is no phase element; expected an Element or several: rt.wave_optics.phase_elements(name or file) "
+            "or, of an array of heights, rt.wave_optics.phase_element(heights, pitch=…, aperture=…, glass=…)"
         )
     return parts
 
