@@ -173,11 +173,11 @@ def trace(
     """Rays on the image surface, and a table of their positions and directions surface by surface.
 
     rays: in front of surface 1, as `rt.tracing.rays` returns them, or a table of rays (.csv) with columns x, y, z, l,
-    m, n and optionally wavelength; rays without one have that of `wavelengths`, by default the primary one. By default: chief,
-    upper, lower and side ray of every object distance, field and wavelength, batch shape (D, F, W, 4), or (F, W, 4) for
-    the lens's distance; fields as for `rt.tracing.rays`, wavelengths the primary one unless given. Rays of a batch of
-    lenses have their axis first, (3, L, …). Paths count from the wavefront of the object point that passes the vertex of
-    surface 1.
+    m, n and optionally wavelength; rays without one have that of `wavelengths`, by default the primary one. By default:
+    chief, upper, lower and side ray of every object distance, field and wavelength, batch shape (D, F, W, 4), or (F, W,
+    4) for the lens's distance; fields as for `rt.tracing.rays`, wavelengths the primary one unless given. Rays of a
+    batch of lenses have their axis first, (3, L, …). Paths count from the wavefront of the object point that passes the
+    vertex of surface 1.
     """
     labels, lens = None, aligned(lens, 3)
     if rays is None:

@@ -259,16 +259,16 @@ def wave_psf(
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
     element, and all up to catalog: as for `rt.wave_optics.phase_elements`; or an Element (of an array by
-    `rt.wave_optics.phase_element`), or several in contact, in whose numbers the kernels are differentiable; of the options up to catalog they use `sensor` (mm from
-    the element) and `exact` alone. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window
-    around the axis; with an even size the axis is a corner of four pixels. A kernel holds the light in each pixel, 1 is
-    all light through the aperture.
-    engine: "auto" takes "radial" (Hankel integrals) for round elements, else "pupil" (matrix Fourier transform);
-    "fresnel" and "angular_spectrum" propagate the field by FFT, as references. tol: bound on the predicted relative L2
-    error of a kernel; samples: across the aperture, instead. `.plan` of the result has both.
-    Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
-    each other, AliasedSampling for samples that would repeat the kernel inside the window, budget.OverBudget where one
-    kernel alone would take too much.
+    `rt.wave_optics.phase_element`), or several in contact, in whose numbers the kernels are differentiable; of the
+    options up to catalog they use `sensor` (mm from the element) and `exact` alone. depths: mm, inf allowed;
+    wavelengths: µm; pixel: mm; size: pixels across a window around the axis; with an even size the axis is a corner of
+    four pixels. A kernel holds the light in each pixel, 1 is all light through the aperture. engine: "auto" takes
+    "radial" (Hankel integrals) for round elements, else "pupil" (matrix Fourier transform); "fresnel" and
+    "angular_spectrum" propagate the field by FFT, as references. tol: bound on the predicted relative L2 error of a
+    kernel; samples: across the aperture, instead. `.plan` of the result has both. Kernels that would take too much
+    memory at once are computed one by one. Raises ValueError for options that exclude each other, AliasedSampling for
+    samples that would repeat the kernel inside the window, budget.OverBudget where one kernel alone would take too
+    much.
     """
     if isinstance(element, str | os.PathLike):
         name = str(element)
