@@ -13,8 +13,8 @@ import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from raytrace.cli.parameters import Parameter, add_parameter
-from raytrace.cli.types import count, file_name, folder_name, seed_number
+from raytrace.cli.options import with_default
+from raytrace.cli.types import count, file_name, folder_name, positive_finite, seed_number
 from raytrace.words import RaytraceError, did_you_mean
 
 
@@ -31,6 +31,13 @@ def option(
     )
 
 
+#: Arguments of `add_argument` by the type of a field.
+_KINDS: dict[type, dict] = {
+    bool: {"action": "store_true"},
+    int: {"type": count, "metavar": "N"},
+    float: {"type": positive_finite},
+    tuple: {"type": positive_finite, "nargs": "+"},
+}
 SEED = option("of random numbers", type=seed_number)
 
 
@@ -41,11 +48,14 @@ def add_options(group, defaults: Mapping, rows: Mapping[str, Mapping], *names: s
     """
     for name in names or rows:
         row, default = dict(rows[name]), defaults[name]
-        flags = (f"--{_spelled(name, row)}",)
+        flag = f"--{_spelled(name, row)}"
         del row["name"], row["unit"], row["between"]
-        kind = "Sequence[float]" if isinstance(default, tuple) else type(default).__name__
-        added = add_parameter(group, name, Parameter(kind, default), {"flags": flags, **row}, keep_default=False)
-        added.help = argparse.SUPPRESS if hidden else added.help
+        settings = _KINDS.get(type(default), {}) | row
+        if "action" not in settings:
+            settings["help"] = with_default(row["help"], default)
+        if hidden:
+            settings["help"] = argparse.SUPPRESS
+        group.add_argument(flag, dest=name, **{key: value for key, value in settings.items() if value is not None})
 
 
 # -- settings from a file ----------------------------------------------------------------------------------------------

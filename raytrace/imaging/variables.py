@@ -68,7 +68,7 @@ from raytrace.tracing.geometry import edge_thickness, gaps, rims
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
-from raytrace.words import RaytraceError
+from raytrace.words import RaytraceError, option
 
 # -- thickness limits --------------------------------------------------------------------------------------------------
 
@@ -319,7 +319,7 @@ class Variables(Owned):
         self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
-                f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
+                f"hold {hold!r}: {beyond}; hold another focal length, or end {option('vary')} with another variable"
             )
 
     @torch.no_grad()
@@ -526,7 +526,7 @@ class Variables(Owned):
         columns = [(one.surface, GLASS[one.quantity]) if one.quantity in GLASS else None for one in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
-            raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
+            raise BadVariables(f"no glass varies: name its numbers in {option('vary')}, as index:1,3 abbe_number:1,3")
         lens = self.design.lens
         pool = pool_of(lens, catalogs_of(lens, self.catalog))
         start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
@@ -579,7 +579,9 @@ def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
     design = design_variables(dataclasses.replace(lens, optimization_data=unsolved), vary)
     for one in design.variables:
         if one.quantity == "glass" or (one.surface, one.quantity) == (0, "thickness"):
-            raise BadVariables(f"`vary={joined(vary)}`: {name_of(one)} is a variable of optimize and jacobian alone")
+            raise BadVariables(
+                f"{option('vary', joined(vary))}: {name_of(one)} is a variable of optimize and jacobian alone"
+            )
     return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
 

@@ -63,7 +63,7 @@ class Stored(NamedTuple):
 
 _CHECKPOINT = Kind(
     BadCheckpoint,
-    "expected what `checkpoint` wrote; start anew without `resume`",
+    "expected a checkpoint of optimize; start anew without it",
     BadCheckpoint,
     "{path}: a checkpoint of {difference}; resume with the options that it was made with",
     unlike,
