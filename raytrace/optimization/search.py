@@ -174,7 +174,7 @@ class Searched(Result):
                 _draw(axes, self, k)
             else:
                 axes.set_axis_off()
-        on_one_scale(panels[:count])
+        on_one_scale([*panels[:count]])
         return figure
 
     def save(self, folder: str | PathLike) -> None:
