@@ -248,6 +248,7 @@ ERRORS = {
     "UnknownNumber": "system.parameter_paths",
     "UnknownOperand": "optimization.merit",
     "UnsupportedSurface": "io.source",
+    "Unlit": "tolerancing.as_built",
     "Untrusted": "tracing.compiler",
     "VariedGlass": "optimization.variables",
     "VirtualImage": "analysis.focus_report",

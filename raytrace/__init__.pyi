@@ -113,6 +113,7 @@ from raytrace.system.parameter_paths import UnknownNumber as UnknownNumber
 from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
 from raytrace.tolerancing.analysis import tolerance as tolerance
+from raytrace.tolerancing.as_built import Unlit as Unlit
 from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.jacobian import NoDerivatives as NoDerivatives
 from raytrace.tolerancing.jacobian import jacobian as jacobian

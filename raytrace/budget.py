@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, with_options
 
 _SMALL = 2**24  # bytes that are always allowed
 _LONG = 30.0  # s
@@ -48,15 +48,16 @@ def within(max_bytes: float | None) -> Iterator[None]:
 def afford(needed: float, cause: str, *, helps: str) -> None:
     """Raise OverBudget if `needed` bytes exceed the limit.
 
-    cause: with its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy.
+    cause: with its size, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: the remedy, its options in braces
+    (`words.with_options`).
     """
     if needed <= _SMALL:
         return
     limit = allowed_bytes()
     if needed > limit:
         raise OverBudget(
-            f"{cause} ({in_words(needed)}; {in_words(limit)} may be taken): {helps}, or allow more by --max-bytes "
-            "(raytrace.budget.within)"
+            f"{cause} ({in_words(needed)}; {in_words(limit)} may be taken): {with_options(helps)}, or allow more by "
+            "--max-bytes (raytrace.budget.within)"
         )
 
 
@@ -65,14 +66,16 @@ def afford_rays(pupil_points: int, **counts: int) -> None:
     rays = math.prod((pupil_points, *counts.values()))
     factors = " × ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
     cause = f"{rays:,} rays ({factors} × {pupil_points:,} of the pupil)"
-    afford(RAY_BYTES * rays, cause, helps="ask for fewer `fields`, `wavelengths` or points of the pupil")
+    afford(RAY_BYTES * rays, cause, helps="ask for fewer {fields}, {wavelengths} or points of the pupil")
 
 
 def forewarn(seconds: float, cause: str, *, helps: str) -> None:
     """Warn TakesLong of a long predicted time, accurate to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:
         length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
-        warnings.warn(f"{cause}: about {length}; for less, {helps}", TakesLong, stacklevel=calling_level())
+        warnings.warn(
+            f"{cause}: about {length}; for less, {with_options(helps)}", TakesLong, stacklevel=calling_level()
+        )
 
 
 def allowed_bytes() -> float:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from raytrace.io import as_lens
 from raytrace.system.lens import Lens, computed_once
-from raytrace.words import known_option, named_value, nameless, with_article
+from raytrace.words import known_option, named_value, nameless, option, with_article
 
 #: Options of several numbers, and which of them may be infinite; those of `fields` may be pairs.
 _FINITE = ("fields", "frequencies", "radii", "wavelengths")
@@ -42,9 +42,11 @@ _KINDS: dict[Any, str] = {
     **{float: "a number", Sequence: "a sequence", Iterable: "a sequence", tuple: "a pair", Callable: "a function"},
 }
 #: Values that functions make, by the name of their class: how to make one.
-_MADE = {"Element": "an Element of rt.elements (a name, a file) or rt.element (an array)"}
+_MADE = {
+    "Element": "an Element of rt.wave_optics.phase_elements (a name, a file) or rt.wave_optics.phase_element (an array)"
+}
 #: Of an array where the name or the file of an element is expected.
-_OF_HEIGHTS = "; an array of heights: rt.element(heights, pitch=…, aperture=…, glass=…)"
+_OF_HEIGHTS = "; an array of heights: rt.wave_optics.phase_element(heights, pitch=…, aperture=…, glass=…)"
 
 
 @functools.cache
@@ -92,11 +94,11 @@ def _check_call(verb: str, parameters: Mapping[str, inspect.Parameter], values: 
         raise TypeError(f"{verb}: {nameless(values[len(placed)], options)}")
     read = {*placed[: len(values)]}
     for name in sorted(read & {*words}):
-        raise TypeError(f"{verb}: `{name}` is given twice, with and without its name: leave one out")
-    for name, option in parameters.items():
-        open_ended = option.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
-        if option.default is option.empty and not open_ended and name not in read and name not in words:
-            raise TypeError(f"{verb}: `{name}` is missing and has no default; add {name}=…")
+        raise TypeError(f"{verb}: {option(name)} is given twice, with and without its name: leave one out")
+    for name, parameter in parameters.items():
+        open_ended = parameter.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
+        if parameter.default is parameter.empty and not open_ended and name not in read and name not in words:
+            raise TypeError(f"{verb}: {option(name)} is missing and has no default; add {name}=…")
 
 
 def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
@@ -176,23 +178,23 @@ def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
     words = {_KINDS.get(kind) or _MADE.get(kind.__name__) or with_article(kind.__name__) for kind in kinds}
     expected = " or ".join(sorted(words))
     hint = _OF_HEIGHTS if verb in ("phase_elements", "read_element") and hasattr(value, "__len__") else ""
-    raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}{hint}")
+    raise TypeError(f"{verb}: {option(name)} is {named_value(value)}; expected {expected}{hint}")
 
 
 def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:
     """Numbers, of one or several; tensors unchanged, their values unread."""
     if isinstance(value, Tensor):
         if value.numel() == 0:
-            raise ValueError(f"{verb}: `{name}` is empty; expected {_numbers(name)}")
+            raise ValueError(f"{verb}: {option(name)} is empty; expected {_numbers(name)}")
         return value.reshape(1) if value.dim() == 0 else value
     value = value.tolist() if hasattr(value, "tolist") else value  # of numpy and pandas
     if isinstance(value, Real):
         value = [value]
     if not isinstance(value, Iterable) or isinstance(value, (str, bytes, Mapping)):
-        raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {_numbers(name)}")
+        raise TypeError(f"{verb}: {option(name)} is {named_value(value)}; expected {_numbers(name)}")
     value = value if isinstance(value, (tuple, list)) else [*value]
     if not value:
-        raise ValueError(f"{verb}: `{name}` is empty; expected {_numbers(name)}")
+        raise ValueError(f"{verb}: {option(name)} is empty; expected {_numbers(name)}")
     return type(value)([_entry(verb, name, entry) for entry in value]) if type(value) in (tuple, list) else value
 
 
@@ -201,11 +203,11 @@ def _entry(verb: str, name: str, entry: object) -> object:
         return entry
     if isinstance(entry, Real):
         if math.isnan(entry) or (math.isinf(entry) and name in _FINITE):
-            raise ValueError(f"{verb}: `{name}` holds {entry}; expected {_numbers(name)}")
+            raise ValueError(f"{verb}: {option(name)} holds {entry}; expected {_numbers(name)}")
         return entry if isinstance(entry, (int, float)) else float(entry)
     if name == "fields" and isinstance(entry, Iterable) and not isinstance(entry, (str, bytes, Mapping)):
         return tuple(_entry(verb, "field", part) for part in entry)
-    raise TypeError(f"{verb}: `{name}` holds {named_value(entry)}; expected {_numbers(name)}")
+    raise TypeError(f"{verb}: {option(name)} holds {named_value(entry)}; expected {_numbers(name)}")
 
 
 def _numbers(name: str) -> str:
@@ -217,9 +219,9 @@ def _number(verb: str, name: str, value: object) -> object:
     if isinstance(value, Tensor):
         return value
     if not isinstance(value, Real):
-        raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected a number")
+        raise TypeError(f"{verb}: {option(name)} is {named_value(value)}; expected a number")
     if math.isnan(value):
-        raise ValueError(f"{verb}: `{name}` is nan; expected a number")
+        raise ValueError(f"{verb}: {option(name)} is nan; expected a number")
     return value
 
 
@@ -227,4 +229,4 @@ def _count(verb: str, name: str, value: object) -> object:
     if isinstance(value, Tensor) or (isinstance(value, Real) and value == value // 1):
         return int(value) if isinstance(value, float) else value
     kind = TypeError if not isinstance(value, Real) else ValueError
-    raise kind(f"{verb}: `{name}` is {named_value(value)}; expected a whole number")
+    raise kind(f"{verb}: {option(name)} is {named_value(value)}; expected a whole number")

@@ -6,7 +6,9 @@ import inspect
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from numbers import Real
 from pathlib import Path
 from typing import TypeVar, cast
@@ -75,6 +77,38 @@ def nameless(value: object, names: Iterable[str]) -> str:
     names = [*names]
     where = f"write name=value (options: {', '.join(names)})" if names else "it takes no further value; leave it out"
     return f"{named_value(value)} is given without a name; {where}"
+
+
+_flags: ContextVar[Mapping[str, str]] = ContextVar("flags")
+
+
+@contextmanager
+def in_command(flags: Mapping[str, str]) -> Iterator[None]:
+    """Within the block, messages name options as a command spells them; flags: by parameter, {"fields": "--field"}."""
+    token = _flags.set(flags)
+    try:
+        yield
+    finally:
+        _flags.reset(token)
+
+
+def option(name: str, value: object = "") -> str:
+    """An option as a message names it: `ray_aiming=real` in Python, --ray-aiming real in a command that has it."""
+    flag, text = _flags.get({}).get(name), str(value)
+    if flag is None:
+        return f"`{name}={text}`" if text else f"`{name}`"
+    return f"{flag} {text}" if text else flag
+
+
+class _Options(dict[str, str]):
+    def __missing__(self, key: str) -> str:
+        name, _, value = key.partition("=")
+        return option(name, value)
+
+
+def with_options(text: str) -> str:
+    """A text whose {fields} or {model=drt} are options, named as by `option`."""
+    return text.format_map(_Options())
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

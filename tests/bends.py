@@ -8,23 +8,23 @@ from problems import number as real
 import raytrace as rt
 
 
-def pose(**numbers) -> rt.Pose:
+def pose(**numbers) -> rt.system.Pose:
     flag = numbers.pop("tilts_first", False)
     tensors = {name: number if isinstance(number, torch.Tensor) else real(number) for name, number in numbers.items()}
-    return rt.Pose(**tensors, tilts_first=flag)
+    return rt.system.Pose(**tensors, tilts_first=flag)
 
 
 def _minus(number):
     return None if number is None else -number
 
 
-def flipped(surface: rt.Surface) -> rt.Surface:
+def flipped(surface: rt.system.Surface) -> rt.system.Surface:
     """A surface for light that runs the other way along z."""
     changes = {name: _minus(getattr(surface, name)) for name in ("thickness", "curvature", "coefficients")}
     return dataclasses.replace(surface, **changes)
 
 
-def inserted(lens: rt.Lens, behind: int, new: list[rt.Surface], rest=lambda surface: surface) -> rt.Lens:
+def inserted(lens: rt.Lens, behind: int, new: list[rt.system.Surface], rest=lambda surface: surface) -> rt.Lens:
     """The lens with surfaces put in behind one of them, and those that follow changed."""
     surfaces = [*lens.surfaces[: behind + 1], *new, *map(rest, lens.surfaces[behind + 1 :])]
     stop = lens.stop + (len(new) if behind < lens.stop else 0)
@@ -36,15 +36,15 @@ def folded(lens: rt.Lens, behind: int, share: float = 0.5, **tilts) -> rt.Lens:
     gap = lens.surfaces[behind].thickness
     # With R = Rx Ry the mirror turns the axes by R D Rᵀ D, D = diag(1, 1, -1): R before it, Ry Rx behind.
     poses = {"before": pose(**tilts), "after": pose(**tilts, tilts_first=True)}
-    mirror = rt.Surface(thickness=(share - 1) * gap, glass=rt.MIRROR, **poses)
+    mirror = rt.system.Surface(thickness=(share - 1) * gap, glass=rt.materials.MIRROR, **poses)
     return inserted(lens.replace(behind, thickness=share * gap), behind, [mirror], flipped)
 
 
 def turned_back(lens: rt.Lens, behind: int, share: float = 0.5) -> rt.Lens:
     """The lens with a plane mirror across the axis, behind which z is turned by 180° about y: light runs along +z."""
     gap = lens.surfaces[behind].thickness
-    mirror = rt.Surface(thickness=real(0.0), glass=rt.MIRROR)
-    back = rt.Surface(thickness=(1 - share) * gap, before=pose(tilt_y=180.0), is_break=True)
+    mirror = rt.system.Surface(thickness=real(0.0), glass=rt.materials.MIRROR)
+    back = rt.system.Surface(thickness=(1 - share) * gap, before=pose(tilt_y=180.0), is_break=True)
     return inserted(lens.replace(behind, thickness=share * gap), behind, [mirror, back])
 
 
@@ -65,7 +65,7 @@ def _both(before: float, after: float | None = None) -> dict:
     return {"before": pose(tilt_x=before), "after": pose(tilt_x=before if after is None else after)}
 
 
-_GROOVES = rt.Grating(0.6, -1.0)
+_GROOVES = rt.system.Grating(0.6, -1.0)
 
 
 def spectrometer(ray_aiming: str = "real") -> rt.Lens:

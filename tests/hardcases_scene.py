@@ -8,6 +8,7 @@ import json
 import os
 from pathlib import Path
 
+import pytest
 import torch
 
 from raytrace.materials.glass import AIR, MIRROR, constant
@@ -114,3 +115,8 @@ class Scene:
             "walk": walk,
             **dict(zip(OUTPUTS, values, strict=True)),
         }
+
+
+def of_kind(kind: str) -> list:
+    """Parameters of a test: the cases of a kind."""
+    return [pytest.param(case, id=f"{kind}-{case['id']}") for case in CASES if case["kind"] == kind]

@@ -7,16 +7,18 @@ import torch
 from optiland.materials import IdealMaterial
 from optiland.optic import Optic
 from optiland.rays import RealRays
+from scripts import script
 from torch import Tensor
 
 from raytrace.bench.measure import squared_radius, variables
-from raytrace.bench.peers import Optiland
 from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens
 from raytrace.system.phases import Grating
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import Frame, frames
+
+Optiland = script("bench_peers").Optiland
 
 # mm, where Optiland's search for a toroid ends: in float32 it would not reach less in a hundred iterations
 _CLOSE = {torch.float32: 1e-4, torch.float64: 1e-10}

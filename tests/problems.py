@@ -3,10 +3,12 @@
 Every problem states the law that makes it exact, so that a test needs no second tracer.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +18,19 @@ from hypothesis import given, settings
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
 from raytrace.optimization.merit import Evaluation
+from raytrace.optimization.operands.boundaries import ENDS
 from raytrace.optimization.variables import DesignVariables
-from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.lens import Fields, Lens, SystemAperture, media
 from raytrace.system.optimization_data import Row
+from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
+from raytrace.tracing.launch import rays_from_infinity, rays_from_point, rays_of_field, vignette
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, scene
+from raytrace.tracing.trace import trace_surfaces
+
+#: Files of third parties, which no clone has: tests of them are marked `needs(FOLDER, …)`.
+SHARED = Path(__file__).parents[2] / "shared"
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
 both_engines = pytest.mark.parametrize("engine", ["eager", "compiled"], indirect=True)
@@ -343,3 +352,60 @@ def vignetting_aperture(radius: float) -> tuple[Aperture, ...]:
 def values(lens: Lens, asked: Sequence[Row], **how) -> np.ndarray:
     """Values (R,) of rows of a merit function."""
     return Evaluation(DesignVariables(lens), asked, **how)(np.zeros(0)).values
+
+
+def fisheye(**others):
+    """Two negative menisci before a positive group; chief rays from 75° reach the stop, the pupil wanders."""
+    elements = [
+        surface(1 / 80, 4.0, 1.6),
+        surface(1 / 22, 22.0),
+        surface(1 / 150, 3.0, 1.6),
+        surface(1 / 20, 25.0),
+        surface(1 / 40, 8.0, 1.7),
+        surface(-1 / 60, 10.0),
+        surface(None, 4.0),
+        surface(-1 / 100, 3.0, 1.75),
+        surface(1 / 30, 8.0, 1.6),
+        surface(-1 / 25, 40.0),
+    ]
+    return lens(elements, **{"stop": 7, "aperture": ("entrance_pupil_diameter", 2.0), **others})
+
+
+def random(*shape, seed=0):
+    """Uniform numbers from 0 to 1, the same for a seed."""
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+@functools.cache
+def semi_diameters(found) -> list[float]:
+    """By torch's trace, surface by surface."""
+    points = torch.tensor(ENDS, dtype=torch.float64).T
+    percent, length = found.optimization_data.semi_diameter_margin
+    sizes = [0.0 if found.surfaces[0].semi_diameter is None else found.surfaces[0].semi_diameter]
+    for k in range(1, len(found.surfaces)):
+        if k in found.optimization_data.semi_diameters:
+            sizes.append(found.surfaces[k].semi_diameter)
+            continue
+        heights = [torch.zeros(())]
+        for wavelength in found.wavelengths:
+            for x, y in zip(found.fields.x, found.fields.y, strict=True):
+                field = torch.stack([x, y])[:, None]
+                rays = rays_of_field(found, field, vignette(found, field, points), wavelength=wavelength)
+                indices = media(found, wavelength)[: k + 1]
+                rays = trace_surfaces(found.surfaces[1 : k + 1], rays, indices=indices, wavelength=wavelength)
+                heights += [height for height in torch.hypot(*rays.position[:2])[rays.valid]]
+        bare = k in (found.stop, len(found.surfaces) - 1)
+        sizes.append(float(max(heights)) * (1 if bare else 1 + percent / 100) + (0 if bare else length))
+    return sizes
+
+
+def rays_of_problem(problem) -> Rays:
+    """Rays through the heights of the problem, turned about z by an angle each, with the path from the source."""
+    height = vector(*problem.heights)
+    angle = torch.arange(len(height), dtype=torch.float64)
+    zero = torch.zeros_like(height)
+    aim = torch.stack([height * torch.cos(angle), height * torch.sin(angle), zero])
+    index = scalar(problem.media[0])
+    if problem.source is None:
+        return rays_from_infinity(torch.stack([zero, zero, zero + 1]), aim, index=index)
+    return rays_from_point(vector(*problem.source)[:, None].expand_as(aim), aim, index=index)

@@ -10,6 +10,7 @@ import torch
 from hypothesis import settings
 
 from raytrace import cli
+from raytrace.analysis.focus_report import focus
 from raytrace.io import read_lens
 from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.compiler import NoCompiler, library
@@ -64,6 +65,12 @@ def lens():
 def triplet():
     """The shipped Cooke triplet."""
     return read_lens("cooke_triplet")
+
+
+@pytest.fixture(scope="module")
+def focused_triplet(triplet):
+    """The same at its best focus."""
+    return focus(triplet).lens
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from test_layers import FLOORS
+from layers import FLOORS
 
 import raytrace as rt
 from raytrace.system.lens import media
@@ -23,6 +23,8 @@ from raytrace.tracing.trace import cross
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Packages that no other imports: measurements.
 APART = ("bench",)
+#: Computations whose files `walks` lists.
+WALKS = ("read_lens", "refraction", 'psf(lens, "drt")', "optimize", "training step")
 #: Of every function that `shared` decorates: its call is that of its caller.
 _DECORATION = media.__code__
 
@@ -116,10 +118,10 @@ def walks() -> dict[str, Callable[[], object]]:
     lens = rt.read_lens("double_gauss").at(object_distance=25e3, fields=[0, 5])  # rays fill the stop: no warning
     first, second = media(lens, lens.wavelengths[:1])[:2]
     start, along = (torch.tensor(v, dtype=torch.float64)[:, None] for v in ([0.0, 5.0, 0.0], [0.0, 0.0, 1.0]))
-    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet(), model="gaussian")
+    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.imaging.RedNet(), model="gaussian")
     pictures, distances = torch.rand(2, 84, 84), torch.tensor([2e4, 3e4], dtype=torch.float64)
-    rays = rt.Rays(start, along, torch.ones(1, dtype=torch.bool))
-    rt.prepare()  # the compiled trace, whatever this machine has compiled before
+    rays = rt.system.Rays(start, along, torch.ones(1, dtype=torch.bool))
+    rt.tracing.prepare()  # the compiled trace, whatever this machine has compiled before
     camera(pictures, distances)  # the sampling is chosen at the first call
     psf, read_lens = rt.psf, rt.read_lens
     optimize, triplet = rt.optimize, rt.read_lens("cooke_triplet")

@@ -114,7 +114,7 @@ def test_a_micrometre_of_the_sensor_moves_every_crossing_by_one():
 
 def test_a_diffractive_lens_shifts_its_focus_against_the_wavelength():
     """f = f0 λ0/λ of a flat diffractive lens, and the same lens in air has no other colour."""
-    plane = dict(thickness=100.0, phase=rt.RadialPhase([-math.pi * 25 / (0.55e-3 * 100)], 5.0, 1.0))
+    plane = dict(thickness=100.0, phase=rt.system.RadialPhase([-math.pi * 25 / (0.55e-3 * 100)], 5.0, 1.0))
     system = rt.lens([plane], stop=1, entrance_pupil_diameter=10, wavelengths=[0.55, 0.5, 0.6])
     found = chromatic_focal_shift(system, samples=11)
     expected = 100 * (0.55 / found.wavelength - 1)

@@ -49,7 +49,7 @@ def _in_glass() -> Lens:
     return rt.lens(rows, stop=1, entrance_pupil_diameter=8.0, fields=[0, 3], **SINGLE)
 
 
-def _with_aperture(aperture: rt.Aperture) -> Lens:
+def _with_aperture(aperture: rt.system.Aperture) -> Lens:
     rows = [
         dict(thickness=0.0, apertures=(aperture,)),
         dict(radius=50.0, thickness=5.0, glass=1.5),
@@ -81,15 +81,15 @@ ZOO = {
     "immersed ellipsoid": lambda: rt.read_lens(CASES / "immersed_ellipsoid.zmx"),
     "obscured": lambda: rt.read_lens("hubble"),
     "obscured asphere": lambda: rt.read_lens(CASES / "obscured_asphere.zmx"),
-    "annulus": lambda: _with_aperture(rt.Aperture("circular", (2.0, 4.0))),
-    "rectangular stop": lambda: _with_aperture(rt.Aperture("rectangular", (3.51, 1.49))),
-    "vane": lambda: _with_aperture(rt.Aperture("rectangular", (0.5, 6.5), obscures=True)),
+    "annulus": lambda: _with_aperture(rt.system.Aperture("circular", (2.0, 4.0))),
+    "rectangular stop": lambda: _with_aperture(rt.system.Aperture("rectangular", (3.51, 1.49))),
+    "vane": lambda: _with_aperture(rt.system.Aperture("rectangular", (0.5, 6.5), obscures=True)),
     "tilted element": _tilted,
     "mirrors off the axis": lambda: rt.read_lens(EXAMPLES / "off_axis_telescope.zmx"),
     "folded": lambda: rt.read_lens(EXAMPLES / "folded_relay.zmx"),
     "aspheres": lambda: rt.read_lens("phone"),
     "vignetting factors": lambda: rt.read_lens("double_gauss_28deg").at(wavelengths=[0.546]),
-    "clipped": lambda: _triplet(**SINGLE).replace(6, apertures=(rt.Aperture("circular", (0.0, 11.0)),)),
+    "clipped": lambda: _triplet(**SINGLE).replace(6, apertures=(rt.system.Aperture("circular", (0.0, 11.0)),)),
     "one configuration of two": lambda: dataclasses.replace(
         _zoom().configuration(2), operands=(), current_configuration=1
     ),
@@ -125,7 +125,7 @@ def relative_fields(lens: Lens) -> list[list[float]]:
 
 def operand(lens: Lens, name: str, integers: tuple = (), numbers: tuple = ()) -> float:
     """The value of one operand, in its unit."""
-    return rt.evaluate(lens, merit=rt.Merit([rt.Row(name, integers, numbers, weight=1.0)])).values.item()
+    return rt.evaluate(lens, merit=rt.Merit([rt.system.Row(name, integers, numbers, weight=1.0)])).values.item()
 
 
 def rule_of(lens: Lens) -> float:
@@ -165,7 +165,7 @@ def test_fields_are_independent():
 
     To 5e-14 mm, a few units in the last place of a path of 100 mm: torch rounds the slopes of several fields otherwise.
     """
-    lens = rt.read_lens("cooke_triplet").replace(6, apertures=(rt.Aperture("circular", (0.0, 13.0)),))
+    lens = rt.read_lens("cooke_triplet").replace(6, apertures=(rt.system.Aperture("circular", (0.0, 13.0)),))
     alone, together = rt.spot(lens, fields=[0]), rt.spot(lens, fields=[0, 20])
     assert bool(alone.arrivals.rays.valid.all())
     assert not bool(together.arrivals.rays.valid.all())
@@ -177,7 +177,9 @@ def test_fields_are_independent():
 
 
 @quiet
-@pytest.mark.parametrize("model", [rt.Gaussian(order=16), rt.DRT(order=5)], ids=["gaussian", "drt"])
+@pytest.mark.parametrize(
+    "model", [rt.psf_models.Gaussian(order=16), rt.psf_models.DRT(order=5)], ids=["gaussian", "drt"]
+)
 def test_moments_of_kernels(lens, model):
     """Centroid and second moments of PSFs are those of spots."""
     lens = lens.at(wavelengths=lens.primary[None])
@@ -193,7 +195,7 @@ def test_spot_merit(lens):
     """The default merit function of spots is the root mean square of their radii, where nothing clips."""
     if not bool(rt.spot(lens).arrivals.rays.valid.all()):
         pytest.skip("rows of a default merit function do not integrate up to the edge of an aperture")
-    merit = rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=14, arms=24)).merit
+    merit = rt.evaluate(lens, merit=rt.optimization.DefaultMerit("spot", rings=14, arms=24)).merit
     squares = rt.spot(lens).whole.mean_square_radius
     weights = lens.fields.weight / lens.fields.weight.sum()
     assert float(merit) == pytest.approx(float((weights * squares).sum().sqrt()), rel=1e-4, abs=PICOMETRE)
@@ -203,8 +205,8 @@ def test_spot_merit(lens):
 def test_spot_of_tolerances(lens):
     """The nominal lens of a tolerance analysis without compensators has the spots of `rt.spot`: of the rings that 1e-4
     takes behind a vane, whose spot of 12 rings is 1.6e-4 off."""
-    rows = [rt.Tolerance("surface_tilt_x", (len(lens.surfaces) - 2,), -1e-3, 1e-3)]
-    nominal = rt.tolerance(lens, rt.Tolerances(tuple(rows)), trials=0).nominal
+    rows = [rt.system.Tolerance("surface_tilt_x", (len(lens.surfaces) - 2,), -1e-3, 1e-3)]
+    nominal = rt.tolerance(lens, rt.tolerancing.Tolerances(tuple(rows)), trials=0).nominal
     squares = rt.spot(lens, rings=24).whole.mean_square_radius
     weights = lens.fields.weight / lens.fields.weight.sum()
     expected = float((weights * squares).sum().sqrt()) / MICROMETRE
@@ -234,14 +236,14 @@ def test_wavefront_of_tolerances(lens):
     assert close(nominal, expected, rel=5e-3, abs=1e-6)
 
 
-def clipped_and_moved(name: str) -> tuple[Lens, rt.Tolerances]:
+def clipped_and_moved(name: str) -> tuple[Lens, rt.tolerancing.Tolerances]:
     """A lens of one wavelength, and the decentre of the surface that clips its beams."""
     lens = member(name)
     lens = lens.at(wavelengths=lens.primary[None], fields=own_fields(lens)[:, -1:])
     surface = next(k for k, surface in enumerate(lens.surfaces) if surface.apertures)
     size = 0.02 * max(lens.surfaces[surface].apertures[0].extent)
-    row = rt.Tolerance("surface_decenter_y", (surface,), -size, size)
-    return lens, rt.Tolerances((row,))
+    row = rt.system.Tolerance("surface_decenter_y", (surface,), -size, size)
+    return lens, rt.tolerancing.Tolerances((row,))
 
 
 @quiet
@@ -251,7 +253,10 @@ def test_perturbed_lenses_of_tolerances(name):
     lens, rows = clipped_and_moved(name)
     sampling = sampling_of(lens)
     errors = torch.tensor([[-1.0], [0.0], [0.6]], dtype=torch.float64) * rows[0].maximum
-    lenses, singles = rt.perturbed(lens, rows, errors), [rt.perturbed(lens, rows, row) for row in errors]
+    lenses, singles = (
+        rt.tolerancing.perturbed(lens, rows, errors),
+        [rt.tolerancing.perturbed(lens, rows, row) for row in errors],
+    )
     waves = CRITERIA["wavefront"].quantity(lenses, sampling).sqrt()
     radii = CRITERIA["rms"].quantity(lenses, sampling).sqrt()
     expected = [variance_less_tilt(single, sampling).sqrt() for single in singles]
@@ -263,11 +268,16 @@ def test_perturbed_lenses_of_tolerances(name):
 @quiet
 def test_errors_that_clip_a_beam():
     """A rim that clips nothing of the nominal lens clips the beam of a lens in which it is decentred."""
-    lens = rt.focus(_with_aperture(rt.Aperture("circular", (0.0, 4.05)))).lens
-    rows, errors = rt.Tolerances((rt.Tolerance("surface_decenter_y", (1,), -0.3, 0.3),)), torch.tensor([[0.0], [0.3]])
+    lens = rt.focus(_with_aperture(rt.system.Aperture("circular", (0.0, 4.05)))).lens
+    rows, errors = (
+        rt.tolerancing.Tolerances((rt.system.Tolerance("surface_decenter_y", (1,), -0.3, 0.3),)),
+        torch.tensor([[0.0], [0.3]]),
+    )
     sampling = sampling_of(lens)
-    radii = CRITERIA["rms"].quantity(rt.perturbed(lens, rows, errors.double()), sampling).sqrt()
-    spots = [rt.spot(rt.perturbed(lens, rows, row), fields=sampling.fields).whole for row in errors.double()]
+    radii = CRITERIA["rms"].quantity(rt.tolerancing.perturbed(lens, rows, errors.double()), sampling).sqrt()
+    spots = [
+        rt.spot(rt.tolerancing.perturbed(lens, rows, row), fields=sampling.fields).whole for row in errors.double()
+    ]
     expected = [1e3 * (sampling.field_weights * spot.mean_square_radius).sum().sqrt() for spot in spots]
     assert close(radii, expected, rel=1e-4)
     assert abs(float(radii[1] / radii[0]) - 1) > 0.01
@@ -292,7 +302,7 @@ def test_derivatives_of_perturbed_lenses(name):
     at = torch.tensor([[0.3 * size]], dtype=torch.float64)
 
     def variance(shift: float) -> float:
-        return float(variance_less_tilt(rt.perturbed(lens, rows, at[0] + shift), sampling))
+        return float(variance_less_tilt(rt.tolerancing.perturbed(lens, rows, at[0] + shift), sampling))
 
     step = 0.05 * size
     less, here, more = variance(-step), variance(0.0), variance(step)
@@ -314,9 +324,9 @@ def test_angles_behind_an_afocal_lens():
     ]
     lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10.0, fields=[0, 1], **SINGLE)
     lens = dataclasses.replace(lens, afocal=True)
-    tilt = rt.Tolerance("surface_tilt_x", (2,), -1e-3, 1e-3)
-    nominal = rt.tolerance(lens, rt.Tolerances((tilt,)), trials=0).nominal
-    merit = rt.evaluate(lens, merit=rt.DefaultMerit("angular", rings=8, arms=24)).merit
+    tilt = rt.system.Tolerance("surface_tilt_x", (2,), -1e-3, 1e-3)
+    nominal = rt.tolerance(lens, rt.tolerancing.Tolerances((tilt,)), trials=0).nominal
+    merit = rt.evaluate(lens, merit=rt.optimization.DefaultMerit("angular", rings=8, arms=24)).merit
     assert 1e-3 * float(nominal) == pytest.approx(float(merit), rel=2e-4)  # q of the criterion to 1e-4
 
 
@@ -328,7 +338,7 @@ def test_energy_of_kernels(lens):
     share = torch.where(spots.arrivals.rays.valid, spots.arrivals.weight, 0.0).sum(-1)[:, 0]
     share = share * beam_share(scene_of(lens, own_fields(lens)))[0, :, 0]
     window = dict(pixel=2.5 * float(spots.whole.geometric_radius.max()) / 21 + 1e-3, size=21)
-    assert close(rt.psf(lens, rt.DRT(order=5), **window).energy[0], share, abs=2e-2)
+    assert close(rt.psf(lens, rt.psf_models.DRT(order=5), **window).energy[0], share, abs=2e-2)
 
 
 # -- wavefronts -------------------------------------------------------------------------------------------------------
@@ -387,7 +397,7 @@ def test_geometric_transfer(lens):
     """The geometric MTF is the transform of the DRT kernel, 1 at frequency 0."""
     lens = lens.at(wavelengths=lens.primary[None])
     pitch = float(rt.spot(lens).whole.geometric_radius.max()) / 40 + 1e-4
-    kernel = rt.psf(lens, rt.DRT(order=5), pixel=pitch, size=99, center="chief").kernel[0]
+    kernel = rt.psf(lens, rt.psf_models.DRT(order=5), pixel=pitch, size=99, center="chief").kernel[0]
     frequencies = torch.tensor([0.0, 0.02, 0.06], dtype=torch.float64) / pitch
     at = pitch * (torch.arange(99) - 49)
     wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
@@ -409,7 +419,7 @@ def test_diffraction_transfer_and_energy(name):
     kernel, at = psf.kernel[0, 0], pitch * (torch.arange(size, dtype=torch.float64) - size // 2)
     frequencies = torch.tensor([0.1, 0.3, 0.6], dtype=torch.float64) * cutoff
     wave = torch.exp(-2j * math.pi * frequencies[:, None] * at) / torch.sinc(frequencies * pitch)[:, None]
-    light = float(rt.psf(lens, rt.DRT(order=5), pixel=1.0, size=21).energy)
+    light = float(rt.psf(lens, rt.psf_models.DRT(order=5), pixel=1.0, size=21).energy)
     expected = (wave @ kernel.sum(1).to(wave)).abs() / light
     curve = rt.mtf(lens, [0.0, *frequencies.tolist(), 1.001 * cutoff], geometric=False)
     assert close(curve.tangential[0, 1:-1], expected, abs=2e-2)
@@ -497,12 +507,12 @@ def test_focus_as_built(name):
     """A camera as built moves its sensor as the compensator of tolerances, and at one field and wavelength as focus."""
     lens = member(name).at(fields=[0, 2])
     sensor = len(lens.surfaces) - 2
-    rows = [rt.Tolerance(kind, (k,), -0.3, 0.3) for kind, k in (("surface_tilt_x", 2), ("thickness", sensor))]
-    rows = rt.Tolerances(tuple(rows), (rt.Compensator(sensor),))
+    rows = [rt.system.Tolerance(kind, (k,), -0.3, 0.3) for kind, k in (("surface_tilt_x", 2), ("thickness", sensor))]
+    rows = rt.tolerancing.Tolerances(tuple(rows), (rt.system.Compensator(sensor),))
     errors = torch.tensor([[0.2, 0.03], [-0.3, -0.05]], dtype=torch.float64)
 
     def shift(lens: Lens) -> torch.Tensor:
-        lenses = lens_as_built(lens, rows, errors, own_fields(lens)), rt.perturbed(lens, rows, errors)
+        lenses = lens_as_built(lens, rows, errors, own_fields(lens)), rt.tolerancing.perturbed(lens, rows, errors)
         built, before = (each.surfaces[-2].thickness.flatten() for each in lenses)
         return built - before
 
@@ -514,7 +524,7 @@ def test_focus_as_built(name):
     lens = lens.at(fields=[0], wavelengths=lens.primary[None])
     distances = [
         float(rt.focus(each).sensor_distance) - float(each.surfaces[-2].thickness)
-        for each in (lens, *(rt.perturbed(lens, rows, row) for row in errors))
+        for each in (lens, *(rt.tolerancing.perturbed(lens, rows, row) for row in errors))
     ]
     assert close(shift(lens), [distance - distances[0] for distance in distances[1:]], rel=1e-4)
 
@@ -522,7 +532,7 @@ def test_focus_as_built(name):
 @quiet
 def test_derivatives_of_the_focus_of_a_clipped_lens():
     """The sensor distance has the derivatives of itself, the motion of the clear pupil's edge included."""
-    lens = _with_aperture(rt.Aperture("rectangular", (3.51, 1.49)))
+    lens = _with_aperture(rt.system.Aperture("rectangular", (3.51, 1.49)))
 
     def distance(curvature):
         return rt.focus(lens.replace(2, curvature=curvature)).sensor_distance

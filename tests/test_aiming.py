@@ -5,8 +5,7 @@ import warnings
 
 import pytest
 import torch
-from problems import vector
-from test_launch import fisheye
+from problems import fisheye, vector
 
 import raytrace as rt
 from raytrace.cli import build_parser
@@ -22,7 +21,7 @@ RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
 def pose(**numbers):
-    return rt.Pose(**numbers)
+    return rt.system.Pose(**numbers)
 
 
 def off_axis_parabola(**how):
@@ -54,7 +53,7 @@ def test_every_verb_traces_the_beam_that_fills_a_decentred_stop():
         ([dict(thickness=5.0), dict(radius=50, thickness=50)], 1, "off"),
         ([dict(thickness=5.0, before=pose(tilt_x=3.0)), dict(radius=50, thickness=50)], 1, "real"),
         ([dict(radius=50, thickness=5, before=pose(y=1.0)), dict(thickness=50)], 2, "real"),
-        ([dict(thickness=5.0, phase=rt.Grating(0.1, 1.0)), dict(thickness=50)], 2, "real"),
+        ([dict(thickness=5.0, phase=rt.system.Grating(0.1, 1.0)), dict(thickness=50)], 2, "real"),
         ([dict(thickness=5.0), dict(thickness=50, before=pose(tilt_x=3.0))], 1, "off"),
     ],
     ids=["straight", "tilted stop", "decentred lens", "grating", "bent behind the stop"],
@@ -95,7 +94,7 @@ def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(
         rt.spot(lens, fields=[0, 40], ray_aiming="paraxial")
         rt.spot(lens, fields=[0, 1])
         rt.spot(lens.replace(1, curvature=curvature), fields=[0, 40])  # as in a loop of optimisation
-        rt.psf(lens, rt.Gaussian(order=3), fields=[40])
+        rt.psf(lens, rt.psf_models.Gaussian(order=3), fields=[40])
         torch.func.vmap(lambda y: (warn_of_filling(lens, torch.stack([0 * y, y])[:, None]), y)[1])(vector(30.0, 40.0))
     from raytrace.cli import main
 
@@ -183,7 +182,7 @@ def test_derivatives_of_an_aimed_beam_are_finite_for_an_object_at_infinity():
 def test_aimed_rays_of_a_batch_of_lenses_are_those_of_each(name, aiming):
     """Launch and trace inside `torch.func.vmap`, and derivatives of each lens."""
     lens = rt.read_lens(name).at(ray_aiming=aiming)
-    pupil, bend = rt.gauss_rings(2)[0], lens.surfaces[2].curvature
+    pupil, bend = rt.maths.gauss_rings(2)[0], lens.surfaces[2].curvature
 
     def hits(change):
         variant = lens.replace(2, curvature=bend + change)
@@ -203,7 +202,7 @@ def test_aimed_rays_of_a_batch_of_lenses_are_those_of_each(name, aiming):
 def test_many_rays_of_one_pupil_are_aimed_as_few_are():
     """A vignetted field at 20° of a retrofocus lens, whose pupil is far from the paraxial one; and half of it."""
     lens = rt.read_lens("retrofocus").at(fields=[20.0])
-    points, _ = rt.gauss_rings(20, 64)
+    points, _ = rt.maths.gauss_rings(20, 64)
     for many in (points, points[:, points[0] > 0]):
         together = launch(lens, many)
         apart = [launch(lens, few) for few in many.split(200, 1)]
@@ -217,7 +216,7 @@ def test_many_rays_of_one_pupil_are_aimed_as_few_are():
 def test_few_rays_of_many_are_differentiated_in_aiming(monkeypatch):
     counts, plain = [], aiming._error_and_jacobian
     monkeypatch.setattr(aiming, "_error_and_jacobian", lambda r, p, f: counts.append(p.shape[-1]) or plain(r, p, f))
-    launch(rt.read_lens("retrofocus"), rt.gauss_rings(20, 64)[0])
+    launch(rt.read_lens("retrofocus"), rt.maths.gauss_rings(20, 64)[0])
     assert max(counts) < 300
 
 
@@ -225,7 +224,7 @@ def test_few_rays_of_many_are_differentiated_in_aiming(monkeypatch):
 def test_points_of_the_pupil_may_have_fewer_axes_than_the_lens(kind):
     """Those of a field each, and a lens with an axis of object distances before that."""
     lens = aligned(rt.read_lens("cooke_triplet").at(ray_aiming=kind), 3)
-    field, points = torch.tensor([[0.0, 0.0], [0.0, 8.0]], dtype=torch.float64), rt.gauss_rings(2, 6)[0]
+    field, points = torch.tensor([[0.0, 0.0], [0.0, 8.0]], dtype=torch.float64), rt.maths.gauss_rings(2, 6)[0]
     each = points[:, None, None] * torch.tensor([1.0, 0.9], dtype=torch.float64)[:, None, None]
     many = lens.replace(0, thickness=torch.tensor([1e3, 2e3, 4e3], dtype=torch.float64).reshape(3, 1, 1, 1))
     found = rays_of_field(many, field[:, :, None, None], each, wavelength=lens.wavelengths[:, None])
@@ -239,5 +238,5 @@ def test_points_of_the_pupil_may_have_fewer_axes_than_the_lens(kind):
 def test_a_search_prepares_the_media_once(monkeypatch):
     counts, plain = [], trace.media
     monkeypatch.setattr(trace, "media", lambda lens, wavelength: counts.append(1) or plain(lens, wavelength))
-    launch(rt.read_lens("double_gauss").at(ray_aiming="real"), rt.hexapolar(2)[0])
+    launch(rt.read_lens("double_gauss").at(ray_aiming="real"), rt.maths.hexapolar(2)[0])
     assert len(counts) == 2  # for the radius of the stop, and for the search

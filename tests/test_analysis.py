@@ -161,7 +161,7 @@ def test_fans_of_other_wavelengths_refer_to_the_first_of_them():
 
 
 def test_an_unknown_reference_is_refused():
-    with pytest.raises(ValueError, match="reference 'chief': expected one of primary, own"):
+    with pytest.raises(ValueError, match=r"'chief': expected .*primary, own"):
         rt.opd_fan(perfect(), reference="chief")
 
 

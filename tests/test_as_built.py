@@ -60,9 +60,9 @@ def test_the_sample_has_the_means_and_variances_of_the_tolerances(cooke):
 
 def test_a_lens_of_the_sample_is_refocused(cooke):
     """Against the spots of its rays on sensors among which a search finds the best."""
-    term = rt.AsBuilt(limits="radius:1=0.3%", fields=[0, 8.4]).of(cooke)
-    bent = rt.perturbed(cooke, term.tolerances, [0.3])
-    points, weights = rt.gauss_rings(3, 6)
+    term = rt.tolerancing.AsBuilt(limits="radius:1=0.3%", fields=[0, 8.4]).of(cooke)
+    bent = rt.tolerancing.perturbed(cooke, term.tolerances, [0.3])
+    points, weights = rt.maths.gauss_rings(3, 6)
     weights = (lens_weights(cooke)[:, None] * weights).flatten().numpy()
 
     def square(distance):
@@ -77,9 +77,9 @@ def test_a_lens_of_the_sample_is_refocused(cooke):
 
 
 def test_expectation_against_random_lenses(cooke):
-    settings = rt.AsBuilt(limits=FEW)
+    settings = rt.tolerancing.AsBuilt(limits=FEW)
     term = settings.of(cooke)
-    errors = rt.draw_errors(term.tolerances, 1500, seed=3)
+    errors = rt.tolerancing.draw_errors(term.tolerances, 1500, seed=3)
     q = term.mean_squares(cooke, torch.cat([errors, -errors])).reshape(2, -1).mean(0)
     uncertainty = float(q.std()) / len(q) ** 0.5
     assert uncertainty < 0.002 * float(q.mean())
@@ -91,7 +91,7 @@ def test_expectation_against_second_derivatives(cooke):
     """`rt.tolerance` has the same expectation from differences of gradients."""
     few = "element_decenter:3=0.05 radius:3=0.2%"
     second = rt.tolerance(cooke, limits=few, trials=0, rings=3, arms=6)
-    term = rt.AsBuilt(limits=few).of(cooke)
+    term = rt.tolerancing.AsBuilt(limits=few).of(cooke)
     increase = 1e-6 * float(second.expected_square) - float(term.nominal(cooke))
     assert abs(float(term.expected(cooke) - term.nominal(cooke)) / increase - 1) < 0.01
 
@@ -99,7 +99,7 @@ def test_expectation_against_second_derivatives(cooke):
 def test_residuals_and_their_derivatives(cooke):
     """The Jacobian by forward derivatives against the gradient of E[q] by the adjoint, and against differences."""
     start, state = states(cooke, "curvature:1,3,6 thickness:2,5 sensor")
-    term = rt.AsBuilt(limits="element_decenter:3=0.05 element_tilt:1=0.1", weight=2.0).of(cooke)
+    term = rt.tolerancing.AsBuilt(limits="element_decenter:3=0.05 element_tilt:1=0.1", weight=2.0).of(cooke)
     residuals, jacobian, lost = term.residuals(state(Dual(start, np.eye(len(start)))), 0.5)
     assert lost == 0
     assert abs(residuals @ residuals / (8 * float(term.expected(cooke))) - 1) < 1e-12
@@ -122,7 +122,7 @@ def test_residuals_and_their_derivatives(cooke):
 
 def test_without_the_compiled_trace(cooke):
     start, state = states(cooke, "curvature:3 thickness:2")
-    term = rt.AsBuilt(limits="element_decenter:3=0.05").of(cooke)
+    term = rt.tolerancing.AsBuilt(limits="element_decenter:3=0.05").of(cooke)
     at = state(Dual(start, np.eye(2)))
     compiled = term.residuals(at, 1.0)
     with trace_engine("eager"):
@@ -135,7 +135,7 @@ def test_without_the_compiled_trace(cooke):
 def test_aimed_rays(cooke):
     lens = cooke.at(ray_aiming="real")
     start, state = states(lens, "curvature:3")
-    term = rt.AsBuilt(limits="element_decenter:3=0.05", rings=2).of(lens)
+    term = rt.tolerancing.AsBuilt(limits="element_decenter:3=0.05", rings=2).of(lens)
     jacobian = term.residuals(state(Dual(start, np.eye(1))), 1.0)[1]
     ends = [term.residuals(state(start + step), 1.0)[0] for step in (1e-6, -1e-6)]
     assert np.abs((ends[0] - ends[1]) / 2e-6 - jacobian[:, 0]).max() < 1e-5 * np.abs(jacobian[:, 0]).max()
@@ -144,20 +144,20 @@ def test_aimed_rays(cooke):
 def test_optimize_lowers_the_expectation(cooke):
     """Of random lenses of another sample."""
     settings = {"merit": "spot", "vary": "curvature:1-4 thickness:2,5 sensor", "hold": "efl=101.2"}
-    as_built = rt.AsBuilt(limits="element_decenter=0.2", weight=20.0, rings=2)
+    as_built = rt.tolerancing.AsBuilt(limits="element_decenter=0.2", weight=20.0, rings=2)
     usual = rt.optimize(cooke, cycles=25, **settings)
     robust = rt.optimize(usual.lens, as_built=as_built, cycles=5, **settings)
     expected = []
     for lens in (usual.lens, robust.lens):
-        term = rt.AsBuilt(limits="element_decenter=0.2").of(lens)
-        expected.append(float(term.mean_squares(lens, rt.draw_errors(term.tolerances, 400, seed=8)).mean()))
+        term = rt.tolerancing.AsBuilt(limits="element_decenter=0.2").of(lens)
+        expected.append(float(term.mean_squares(lens, rt.tolerancing.draw_errors(term.tolerances, 400, seed=8)).mean()))
     assert expected[1] < 0.995 * expected[0]
     assert abs(float(rt.first_order(robust.lens).effective_focal_length) - 101.2) < 1e-6
     change = robust.as_built
     assert change.nominal[1] < change.expected[1] < change.expected[0]
     assert robust.merit_after < robust.merit_before
     assert abs(robust.merit_after / float(robust.history[-1, 0]) - 1) < 1e-12
-    assert "as built (6 tolerances, of `limits`, weight 20): expected" in str(robust)
+    assert "as built (6 tolerances, of limits, weight 20): expected" in str(robust)
     assert robust.document()["as_built"]["expected"] == list(change.expected)
     assert usual.as_built is None
 
@@ -165,11 +165,14 @@ def test_optimize_lowers_the_expectation(cooke):
 def test_weight_is_relative_to_all_rows_but_boundaries(cooke):
     """Of a merit function of spots M² is the mean square spot of the nominal lens, and E[q] counts alike."""
     lens = rt.focus(cooke, fields=[0, 8.4, 11.9]).lens
-    expected, ratios = float(rt.AsBuilt(limits=FEW).of(lens).expected(lens)), []
-    for merit in (rt.DefaultMerit("spot"), rt.DefaultMerit("spot", glass_thickness=(1, 20), edge=0.5)):
+    expected, ratios = float(rt.tolerancing.AsBuilt(limits=FEW).of(lens).expected(lens)), []
+    for merit in (
+        rt.optimization.DefaultMerit("spot"),
+        rt.optimization.DefaultMerit("spot", glass_thickness=(1, 20), edge=0.5),
+    ):
         nominal = float(rt.evaluate(lens, merit=merit).merit) ** 2
         for weight in (1.0, 3.0):
-            settings = rt.AsBuilt(limits=FEW, weight=weight)
+            settings = rt.tolerancing.AsBuilt(limits=FEW, weight=weight)
             end = rt.optimize(lens, merit=merit, vary="sensor", cycles=0, as_built=settings)
             ratios.append((end.merit_before**2 - nominal) / (weight * nominal))
     assert np.allclose(ratios, ratios[0], rtol=1e-9)
@@ -181,21 +184,21 @@ def test_errors(cooke):
     spots = {"merit": "spot", "vary": "curvature:1", "cycles": 1}
     for weight in (0.0, -1.0, float("inf")):
         with pytest.raises(ValueError, match="above 0"):
-            rt.AsBuilt("precision", weight=weight)
+            rt.tolerancing.AsBuilt("precision", weight=weight)
     with pytest.raises(ValueError, match="leave `grade` and `limits` out"):
-        rt.AsBuilt("precision", tolerances=rt.tolerances(cooke, "radius=0.1"))
+        rt.tolerancing.AsBuilt("precision", tolerances=rt.tolerances(cooke, "radius=0.1"))
     with pytest.raises(rt.BadTolerance, match="no tolerances of its own"):
-        rt.optimize(cooke, as_built=rt.AsBuilt(), **spots)
+        rt.optimize(cooke, as_built=rt.tolerancing.AsBuilt(), **spots)
     with pytest.raises(rt.BadTolerance, match="precision"):
-        rt.optimize(cooke, as_built=rt.AsBuilt("precise"), **spots)
-    tolerances = rt.tolerances(cooke, "radius=0.1", compensators=[rt.Compensator(2)])
+        rt.optimize(cooke, as_built=rt.tolerancing.AsBuilt("precise"), **spots)
+    tolerances = rt.tolerances(cooke, "radius=0.1", compensators=[rt.system.Compensator(2)])
     with pytest.raises(rt.BadTolerance, match="the distance of a plane sensor"):
-        rt.optimize(cooke, as_built=rt.AsBuilt(tolerances=tolerances), **spots)
+        rt.optimize(cooke, as_built=rt.tolerancing.AsBuilt(tolerances=tolerances), **spots)
     with pytest.raises(rt.BadTolerance, match="no ray of a field"):
-        rt.optimize(cooke, as_built=rt.AsBuilt("precision", fields=[80]), **spots)
+        rt.optimize(cooke, as_built=rt.tolerancing.AsBuilt("precision", fields=[80]), **spots)
     merit = lambda lens: lens.surfaces[1].curvature.reshape(())  # noqa: E731
     with pytest.raises(rt.NoProblem, match="goes with a merit of rows"):
-        rt.optimize(cooke, merit=merit, vary="curvature:1", as_built=rt.AsBuilt("precision"))
+        rt.optimize(cooke, merit=merit, vary="curvature:1", as_built=rt.tolerancing.AsBuilt("precision"))
     with pytest.raises(TypeError, match="as_built"):
         rt.optimize(cooke, as_built="precision", **spots)
 
@@ -205,7 +208,7 @@ def test_search_orders_minima_by_the_merit_as_built(cooke):
     """The same minima as without, in another order, each with the figures of `optimize`."""
     lens = cooke.at(f_number=5, fields=[0, 8])
     settings = {"merit": "spot", "vary": "curvature:1,4 sensor", "hold": "efl=101.2", "starts": 3}
-    as_built = rt.AsBuilt(limits="element_decenter:3=0.2", weight=5.0, rings=2)
+    as_built = rt.tolerancing.AsBuilt(limits="element_decenter:3=0.2", weight=5.0, rings=2)
     usual, ranked = rt.search(lens, **settings), rt.search(lens, as_built=as_built, **settings)
     assert sorted(usual.merit.tolist()) == sorted(ranked.merit.tolist())
     merit, expected, nominal = ranked.as_built.unbind(-1)
@@ -216,7 +219,7 @@ def test_search_orders_minima_by_the_merit_as_built(cooke):
         assert abs(float(expected[k]) / end.as_built.expected[0] - 1) < 1e-12
         assert abs(float(nominal[k]) / end.as_built.nominal[0] - 1) < 1e-12
     assert "merit_as_built" in ranked.columns()
-    assert "in the order of the merit as built: of `limits`, weight 5" in str(ranked)
+    assert "in the order of the merit as built: of limits, weight 5" in str(ranked)
     assert usual.as_built is None
     with pytest.raises(rt.BadTolerance, match="no tolerances of its own"):
-        rt.search(lens, as_built=rt.AsBuilt(), **settings)
+        rt.search(lens, as_built=rt.tolerancing.AsBuilt(), **settings)

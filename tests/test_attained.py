@@ -58,7 +58,7 @@ def test_a_search_refuses_them_too(triplet):
 
 
 def test_violations_are_in_text_document_and_figure(triplet):
-    merit = rt.DefaultMerit("spot", air_thickness="0.1:90", glass_thickness="0.5:1")
+    merit = rt.optimization.DefaultMerit("spot", air_thickness="0.1:90", glass_thickness="0.5:1")
     with pytest.warns(NotReached, match="MXCG 1 7 <= 1 .row 7. is not reached"):
         found = rt.optimize(triplet, merit=merit, vary="curvature", hold="efl=100", cycles=3)
     assert found.falls_short
@@ -81,7 +81,7 @@ def test_violations_are_in_text_document_and_figure(triplet):
 
 def test_boundaries_are_met_within_a_micrometre_or_a_thousandth(triplet):
     found = rt.optimize(
-        triplet, merit=rt.DefaultMerit("spot", air_thickness="0.5:90", edge=1.0, glass_thickness="2:9"),
+        triplet, merit=rt.optimization.DefaultMerit("spot", air_thickness="0.5:90", edge=1.0, glass_thickness="2:9"),
         vary="curvature thickness", hold="efl=100", cycles=30,
     )  # fmt: skip
     assert not found.falls_short

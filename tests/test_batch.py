@@ -35,8 +35,8 @@ def perturbed(name, count=3, ray_aiming="off", posed=True):
         lens = lens.replace(k, **change)
     if not posed:
         return lens
-    lens = lens.replace(2, before=rt.Pose(y=0.002 * error, tilt_x=0.01 * error))
-    return lens.replace(3, after=rt.Pose(tilt_x=-0.01 * error, tilts_first=True))
+    lens = lens.replace(2, before=rt.system.Pose(y=0.002 * error, tilt_x=0.01 * error))
+    return lens.replace(3, after=rt.system.Pose(tilt_x=-0.01 * error, tilts_first=True))
 
 
 def psf_of(model):
@@ -50,12 +50,16 @@ def psf_of(model):
 
 
 #: PSF models whose kernels of one call do not share a decision: the number of cells of DRT is that of the widest.
-MODELS = {"paraxial": rt.Paraxial(order=0), "fourier": rt.Fourier(order=1), "gaussian": rt.Gaussian(order=6)}
-MODELS |= {"wave": rt.Wave(order=0)}
+MODELS = {
+    "paraxial": rt.psf_models.Paraxial(order=0),
+    "fourier": rt.psf_models.Fourier(order=1),
+    "gaussian": rt.psf_models.Gaussian(order=6),
+}
+MODELS |= {"wave": rt.psf_models.Wave(order=0)}
 
 VERBS = {
     "effective focal length": lambda lens: rt.first_order(lens).effective_focal_length,
-    "rays": lambda lens: rt.rays(lens).position.movedim(0, -1),
+    "rays": lambda lens: rt.tracing.rays(lens).position.movedim(0, -1),
     "rms": lambda lens: rt.spot(lens).rms_radius,
     "centroid": lambda lens: rt.spot(lens).centroid.movedim(0, -1),
     "spots of all wavelengths": lambda lens: rt.spot(lens, reference="chief").whole.mean_square_radius,
@@ -138,7 +142,7 @@ def test_derivative_of_every_lens():
 def test_batch_of_lenses_in_a_list():
     lens = rt.read_lens("double_gauss")
     lenses = [lens.replace(1, radius=radius) for radius in (60.0, 61.0, 62.0)]
-    found = rt.batch(lenses)
+    found = rt.system.batch(lenses)
     assert found.surfaces[1].curvature.shape == (3,)
     assert found.surfaces[2].curvature is lens.surfaces[2].curvature
     assert torch.equal(rt.spot(found).rms_radius[1], rt.spot(lenses[1]).rms_radius)
@@ -149,16 +153,16 @@ def test_batch_of_lenses_in_a_list():
 
 def test_wrong_batches_are_refused():
     lens, two = rt.read_lens("double_gauss"), torch.ones(2, dtype=torch.float64)
-    with pytest.raises(ValueError, match="surface 1: thickness has numbers of 2 lenses, surface 2: thickness of 3"):
+    with pytest.raises(ValueError, match=r"surface 1: .* 2 lenses, surface 2: .* 3"):
         lens.replace(1, thickness=two).replace(2, thickness=torch.ones(3, dtype=torch.float64)).at(ray_aiming="off")
     with pytest.raises(TypeError, match="a single lens"):
         lens[0]
     with pytest.raises(IndexError, match="lens 2 of a batch of 2"):
         lens.replace(1, thickness=two)[2]
     with pytest.raises(ValueError, match="no lenses"):
-        rt.batch([])
+        rt.system.batch([])
     with pytest.raises(ValueError, match="lens 1 has other surfaces"):
-        rt.batch([lens, rt.read_lens("singlet")])
+        rt.system.batch([lens, rt.read_lens("singlet")])
     with pytest.raises(ValueError, match="one lens, not a batch"):
         rt.spot(lens.replace(1, thickness=8.0 + two)).plot()
 
@@ -185,7 +189,7 @@ def test_a_clipped_batch_is_a_loop(verb):
     """The pupil of every lens ends at its own rims."""
     lens = rt.read_lens("double_gauss").at(fields=[0, 10], ray_aiming="off")
     for k, radius in ((1, 20.0), (11, 16.0)):
-        lens = lens.replace(k, apertures=(rt.Aperture("circular", (0.0, radius)),))
+        lens = lens.replace(k, apertures=(rt.system.Aperture("circular", (0.0, radius)),))
     gap = lens.surfaces[2].thickness + torch.tensor([0.0, 0.05, 0.1], dtype=torch.float64)
     lenses = lens.replace(2, thickness=gap)
     assert not bool(rt.spot(lens).arrivals.rays.valid.all())
@@ -218,7 +222,7 @@ def test_orders_are_chosen_for_each_lens_and_distance_alone():
     """A PSF is that of a call for it alone, whatever the others need."""
     lens = rt.read_lens("tessar")
     bent = lens.replace(1, curvature=0.98 * lens.surfaces[1].curvature)
-    together = rt.psf(rt.batch([lens, bent]), "gaussian", fields=[10.0])
+    together = rt.psf(rt.system.batch([lens, bent]), "gaussian", fields=[10.0])
     alone = [rt.psf(each, "gaussian", fields=[10.0]) for each in (lens, bent)]
     assert alone[0].order != alone[1].order
     assert torch.equal(together.kernel, torch.cat([each.kernel for each in alone]))

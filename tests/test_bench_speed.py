@@ -12,15 +12,9 @@ import torch
 from scripts import script
 
 from raytrace.bench import measure as timing
-from raytrace.bench import speed
-from raytrace.bench.figures import speed_figure
-from raytrace.bench.measure import Own, Row, errors_of, field_rays, in_turns, leaves_of, squared_radius
-from raytrace.bench.report import Measured
-from raytrace.bench.speed import STAGES, Bench, Sizes, document, measure, slope, three_aspheres, with_sensor_leaf
-from raytrace.cli import main
+from raytrace.bench.measure import Row, Tracer, field_rays, in_turns, squared_radius
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
-from raytrace.pages import KEPT
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.compiler import NoCompiler
@@ -28,17 +22,20 @@ from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
-extended = script("bench_speed")
-Limit, build = extended.Limit, extended.build
+extended, speed, errors_of = script("bench_speed"), script("bench_ratios"), script("bench_reference").errors_of
+Limit, build, KEPT = extended.Limit, extended.build, script("pages").KEPT
+STAGES, Bench, Sizes, EngineTracer = speed.STAGES, speed.Bench, speed.Sizes, speed.EngineTracer
+document, measure, slope, leaves_of = speed.document, speed.measure, speed.slope, speed.leaves_of
+three_aspheres, with_sensor_leaf = speed.three_aspheres, speed.with_sensor_leaf
 
 pytestmark = pytest.mark.usefixtures("same_threads")
 
-#: Ratios of `raytrace bench speed --json`.
+#: Ratios of bench_ratios.py.
 KEYS = {
     "forward_over_optiland", "backward_over_forward", "backward_over_optiland", "small_batch_ms", "sensor_step_gain",
     "small_batch_over_optiland", "asphere_over_optiland",
 }  # fmt: skip
-#: Those of docs/experiments/bench_speed.py in addition.
+#: Those of bench_speed.py in addition.
 ADDED = {
     "forward_over_limit", "forward_over_plain_limit", "asphere_over_limit", "bytes_per_ray", "spot_process_ratio",
     "two_process_gain",
@@ -162,8 +159,8 @@ def test_no_compiler_is_an_error():
 
 def test_the_aspheres_are_strong_and_right():
     lens = three_aspheres()
-    errors = errors_of(Own(lens, torch.float64, engine="eager"), lens, field_rays(lens, 24))
-    assert errors.position < 1e-7  # nm
+    errors = errors_of(EngineTracer(lens, torch.float64, engine="eager"), lens, field_rays(lens, 24))
+    assert errors["position"] < 1e-7  # nm
     for surface in lens.surfaces[1:4]:
         powers = torch.tensor([3.0 ** (2 * j) for j in range(1, 6)], dtype=torch.float64)
         assert float((surface.coefficients * powers).sum().abs()) > 0.1  # mm at a height of 3 mm
@@ -173,9 +170,10 @@ def test_gradient_is_by_curvatures_thicknesses_and_every_index():
     """The last of the leaves are indices; theirs against central differences of the merit."""
     lens = read_lens("double_gauss")
     rays, centroid = field_rays(lens, 50), torch.zeros(2, dtype=torch.float64)
-    found = Own(lens, torch.float64, engine="eager", by_indices=True).gradient(rays, centroid)
+    found = EngineTracer(lens, torch.float64, engine="eager").gradient(rays, centroid)
     surfaces, indices, leaves = leaves_of(lens)
-    few = Own(lens, torch.float64, engine="eager").gradient(rays, centroid)  # 8 curvatures and 11 thicknesses
+    with trace_engine("eager"):
+        few = Tracer(lens, torch.float64).gradient(rays, centroid)  # 8 curvatures and 11 thicknesses
     assert torch.equal(torch.stack(found[:19]), torch.stack(few))
     assert len(found) == len(leaves) == 19 + 11  # runs of one medium: air in front to air behind
     assert indices[5] is indices[6]  # the stop bends nothing
@@ -214,26 +212,20 @@ def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
     assert float(speed.slope_of_parabolas(parabola, leaf, float(leaf.detach()))) == pytest.approx(expected, rel=1e-9)
 
 
-def test_entrants_take_turns_each_prepared(monkeypatch):
+def test_entrants_take_turns():
     said = []
-
-    def job(name):
-        return lambda: said.append(name), lambda: said.append(f"({name})")
-
-    seconds = in_turns({"a": job("a"), "b": job("b")}, repeats=3, threads=1)
+    seconds = in_turns({name: lambda name=name: said.append(name) for name in "ab"}, repeats=3, threads=1)
     assert {name: len(taken) for name, taken in seconds.items()} == {"a": 3, "b": 3}
-    turn = ["(a)", "a", "(b)", "b"]
-    assert said[8:] == 3 * turn  # behind two calls of each to warm up
-    assert said[:8] == ["(a)", "a"] * 2 + ["(b)", "b"] * 2
+    assert said == [*"aabb", *"ababab"]  # behind two calls of each to warm up
 
 
-class Peer(Own):
+class Peer(EngineTracer):
     """A peer that is this package under another name."""
 
     backend = "torch"
 
     def __init__(self, lens, dtype):
-        super().__init__(lens, dtype, engine="eager", by_indices=True)
+        super().__init__(lens, dtype, engine="eager")
         self.name = "Optiland, torch"
 
 
@@ -300,7 +292,7 @@ def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     others = {"bytes_per_ray": 64.0, "bytes_per_ray_rays": 99, "spot_process_ratio": 1.2, "two_process_gain": 1.9}
     ratios = {dtype: numbers | others | {"asphere_newton_steps": 4} for dtype, numbers in ratios.items()}
     page = extended.lines(ratios, sizes=TINY, about=about, compiled="cc -O3", repeats=1)
-    found = Measured(rows, page, {}, speed_figure, ("speed.md", "speed"))
+    found = extended.Page(rows, page, {}, extended.speed_figure, ("speed.md", "speed"))
     (tmp_path / "speed.md").write_text(f"stale\n{KEPT}\nwords\n")
     found.save_page(tmp_path)
     page = (tmp_path / "speed.md").read_text(encoding="utf-8")
@@ -334,20 +326,18 @@ def test_targets_are_judged_on_the_right_side():
 
 
 def test_document_has_speeds_by_entrant_in_millions():
-    row = Row("raytrace", "float32", "forward", False, 64, 64, 1e-3, 1e-3, 5e6, 1.0, None, None)
+    row = Row("raytrace", "float32", "forward", False, 64, 64, 1e-3, 5e6, 1.0, None, None)
     found = document([row], {"float32": {"two_process_gain": math.inf, "bytes_per_ray": 64.0}})
     assert found["float32"]["millions_per_second"] == {"forward": {"raytrace": {"64": 5.0}}}
     assert found["float32"]["two_process_gain"] is None
     assert found["float32"]["bytes_per_ray"] == 64.0
 
 
-# -- the command -------------------------------------------------------------------------------------------------------
-
-COMMAND = ["bench", "speed", "--quick", "--repeats", "1", "--no-peers", "--threads", "1"]
+# -- the script --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_command_and_script_write_page_table_and_figure(monkeypatch, tmp_path, capsys):
+def test_script_writes_page_table_and_figure(monkeypatch, tmp_path, capsys):
     """Without compiler and peers, whose ratios are None."""
 
     def refuse():
@@ -356,33 +346,21 @@ def test_command_and_script_write_page_table_and_figure(monkeypatch, tmp_path, c
     monkeypatch.setattr(extended, "build", refuse)
     monkeypatch.setattr(speed, "QUICK", TINY)
     kept = tmp_path / "speed.md"
-    for keys, call in ((KEYS, lambda *options: main([*COMMAND, *options])), (KEYS | ADDED, run_script)):
-        kept.write_text(f"stale\n{KEPT}\nby hand\n", encoding="utf-8")
-        assert not call("--json", "--docs", str(tmp_path))
-        document = json.loads(capsys.readouterr().out)
-        for dtype in ("float32", "float64"):
-            assert set(document[dtype]) >= keys
-            for key in keys:
-                absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
-                assert (document[dtype][key] is None) == absent, key
-        assert document["machine"]["torch threads"] == 1
-        page = kept.read_text(encoding="utf-8")
-        assert page.endswith(f"{KEPT}\nby hand\n")
-        assert "of processor time" in page
-        assert "stale" not in page
-        assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
-        assert (tmp_path / "speed.csv").exists()
-
-
-def run_script(*options):
-    extended.main(["--quick", "--repeats", "1", "--no-peers", *options])
-
-
-def test_options_of_other_benchmarks_are_refused(capsys):
-    assert main(["bench", "speed", "--rays", "5"]) != 0
-    assert "bench speed takes no --rays" in capsys.readouterr().err
-    assert main(["bench", "trace", "--quick"]) != 0
-    assert "bench trace takes no --quick" in capsys.readouterr().err
+    kept.write_text(f"stale\n{KEPT}\nby hand\n", encoding="utf-8")
+    extended.main(["--quick", "--repeats", "1", "--no-peers", "--json", "--docs", str(tmp_path)])
+    document = json.loads(capsys.readouterr().out)
+    for dtype in ("float32", "float64"):
+        assert set(document[dtype]) >= KEYS | ADDED
+        for key in KEYS | ADDED:
+            absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
+            assert (document[dtype][key] is None) == absent, key
+    assert document["machine"]["torch threads"] == 1
+    page = kept.read_text(encoding="utf-8")
+    assert page.endswith(f"{KEPT}\nby hand\n")
+    assert "of processor time" in page
+    assert "stale" not in page
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "speed.csv").exists()
 
 
 @pytest.mark.slow

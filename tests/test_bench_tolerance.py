@@ -1,13 +1,14 @@
-"""`raytrace bench tolerance` runs end to end; the lens moved as in Optiland's tutorial has its figures. No timings."""
+"""The benchmark of tolerancing runs end to end; the lens moved as in Optiland's tutorial has its figures."""
 
 import json
 
 import pytest
 import torch
+from scripts import script
 
-from raytrace.bench import tolerance
-from raytrace.cli import main
 from raytrace.maths.sampling import gauss_rings
+
+tolerance = script("bench_tolerance")
 
 pytestmark = pytest.mark.usefixtures("same_threads")
 
@@ -21,24 +22,11 @@ def test_the_first_radius_moved_has_the_printed_figures():
 
 def test_every_row_and_the_figure(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(tolerance, "TRIALS", 16)
-    picture = tmp_path / "speed.png"
-    arguments = [
-        "bench",
-        "tolerance",
-        "--no-peers",
-        "--repeats",
-        "1",
-        "--threads",
-        "1",
-        "--plot",
-        str(picture),
-        "--json",
-    ]
-    assert main(arguments) == 0
+    tolerance.main(["--no-peers", "--repeats", "1", "--docs", str(tmp_path), "--json"])
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [row["rays"] for row in rows] == [549, 216]
     assert all(row["errors"] == 27 and row["lenses"] == 16 and row["speed"] > 0 for row in rows)
-    assert picture.stat().st_size > 1000
+    assert (tmp_path / "tolerancing.png").stat().st_size > 1000
 
 
 def test_the_sensor_is_at_the_least_mean_square():
@@ -53,8 +41,7 @@ def test_the_sensor_is_at_the_least_mean_square():
 
 def test_optiland_computes_the_same_lenses():
     pytest.importorskip("optiland")
-    from raytrace.bench import peers
-
+    peers = script("bench_peers")
     errors = tolerance.draw_errors(tolerance.tolerances(), 3)
     found, _ = peers.tolerancing(tolerance.tolerances(), errors, 4, lambda: None, 1)
     study = tolerance.study(tolerance.triplet(), tolerance.equal_rings(4))

@@ -8,10 +8,7 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.bench.report import Measured
-from raytrace.pages import KEPT
-
-bench = script("bench_wave")
+bench, KEPT = script("bench_wave"), script("pages").KEPT
 ERROR, SITZMANN, WaveRow = bench.ERROR, bench.SITZMANN, bench.WaveRow
 agreement, bench_scene, coefficients_of, distance = (
     bench.agreement,
@@ -96,7 +93,7 @@ def test_target_is_judged_by_the_fastest_within_the_error():
 
 def test_page_and_table_hold_the_figures(tmp_path):
     said = lines(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5)
-    found = Measured(ROWS, said, {}, bench.wave_figure, ("wave_bench.md", "wave/speed"))
+    found = bench.Page(ROWS, said, {}, bench.wave_figure, ("wave_bench.md", "wave/speed"))
     (tmp_path / "wave_bench.md").write_text(f"stale\n{KEPT}\nwords of a reader\n")
     found.save_page(tmp_path)
     page = (tmp_path / "wave_bench.md").read_text()

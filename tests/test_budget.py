@@ -35,7 +35,7 @@ def lens():
 def test_a_limit_holds_within_its_block_and_half_of_what_is_free_elsewhere(monkeypatch):
     monkeypatch.setattr(budget, "free_bytes", lambda: 4e9)
     afford(1.9e9, "a thing", helps="less")
-    with pytest.raises(OverBudget, match=r"a thing \(2.1 GB; 2 GB may be taken\): less, or allow more by --max-bytes"):
+    with pytest.raises(OverBudget, match=r"a thing \(2.1 GB; 2 GB .*--max-bytes"):
         afford(2.1e9, "a thing", helps="less")
     with within(1e8), pytest.raises(OverBudget, match="100 MB may be taken"):
         afford(1.01e8, "a thing", helps="less")
@@ -136,9 +136,7 @@ def test_long_computations_are_reported_before_they_start(lens):
     """Ideal waves at F/0.1: minutes. The warning made an error stops them."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", TakesLong)
-        with pytest.raises(
-            TakesLong, match=r"points of each pixel: about \d+ (s|minutes); for less, ask for a smaller"
-        ):
+        with pytest.raises(TakesLong, match=r"about \d+ (s|minutes); .*smaller"):
             psf(fast(lens, 0.1), "fourier", fields=torch.zeros(2, 1, dtype=torch.float64))
 
 

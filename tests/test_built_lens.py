@@ -45,14 +45,16 @@ def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, cente
     settings = dataclasses.replace(BUILT, model=model, refocus="none", fields=(0.0, 7.0), center=center)
     built = camera(lens, settings)
     built._order = 2
-    errors, distances = rt.draw_errors(built.tolerances, 2, seed=5), DISTANCES[:2]
-    parameters = rt.Gaussian(order=2) if model == "gaussian" else rt.DRT(order=2)
+    errors, distances = rt.tolerancing.draw_errors(built.tolerances, 2, seed=5), DISTANCES[:2]
+    parameters = rt.psf_models.Gaussian(order=2) if model == "gaussian" else rt.psf_models.DRT(order=2)
     conditions = {"fields": built.fields[:, [1]], "size": 7, "normalise": "window", "center": center}
 
     def expected(errors, distances):
         """Of each lens alone: a camera's kernel does not depend on the others of its call."""
         each = zip(errors.reshape(len(distances), -1).split(1), distances.split(1), strict=True)
-        lenses = [(rt.perturbed(built.variables(), built.tolerances, error), distance) for error, distance in each]
+        lenses = [
+            (rt.tolerancing.perturbed(built.variables(), built.tolerances, error), distance) for error, distance in each
+        ]
         kernels = [rt.psf(one, parameters, object_distances=z, **conditions).kernel for one, z in lenses]
         return torch.cat(kernels).flip(-1)  # columns of pictures grow towards -x
 
@@ -82,15 +84,15 @@ def test_the_sensor_follows_the_best_focus(lens):
     settings = dataclasses.replace(BUILT, start="rms", fields=(0.0, 7.0))
     built = camera(lens, settings)
     with torch.no_grad():
-        errors = rt.draw_errors(built.tolerances, 2, seed=3)
+        errors = rt.tolerancing.draw_errors(built.tolerances, 2, seed=3)
         nominal = built.variables()
-        least = rt.perturbed(nominal, built.tolerances, errors)
+        least = rt.tolerancing.perturbed(nominal, built.tolerances, errors)
         moved = built.as_built(errors)
         shift = sensors(moved) - sensors(least)
         assert float(shift.abs().min()) > 0.01  # mm
         at = {}
         for step in (-1e-3, 0.0, 1e-3):  # the vertices of both parabolas
-            for name, one in (("nominal", rt.batch([nominal])), ("built", moved)):
+            for name, one in (("nominal", rt.system.batch([nominal])), ("built", moved)):
                 shifted = one.replace(11, thickness=sensors(one) + step)
                 at[name, step] = mean_square_radius(shifted, built.fields)
         vertex = {
@@ -102,9 +104,11 @@ def test_the_sensor_follows_the_best_focus(lens):
 
 def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
     built = camera(lens, BUILT)
-    errors = rt.draw_errors(built.tolerances, 4)
+    errors = rt.tolerancing.draw_errors(built.tolerances, 4)
     with torch.no_grad():
-        still = sensors(rt.perturbed(built.variables(), built.tolerances, errors))  # its gap has errors as well
+        still = sensors(
+            rt.tolerancing.perturbed(built.variables(), built.tolerances, errors)
+        )  # its gap has errors as well
         free = sensors(built.as_built(errors)) - still
         assert float(free.abs().max()) > 0.1  # so that the limit below acts
         for limit in (0.0, 0.05):
@@ -119,7 +123,7 @@ def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
 def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, refocus):
     built = camera(lens, dataclasses.replace(BUILT, refocus=refocus, size=21, fields=(7.0,)))
     built._order = 2
-    errors = rt.draw_errors(built.tolerances, 3, seed=2)
+    errors = rt.tolerancing.draw_errors(built.tolerances, 3, seed=2)
     weights = torch.linspace(0, 1, 21, dtype=torch.float64)
 
     def merit():
@@ -140,7 +144,7 @@ def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, ref
 def test_errors_are_drawn_by_the_number_of_the_sample(lens, pictures):
     built = camera(lens, BUILT)
     every = [batch(pictures, BUILT, list(range(12)), epoch, built.tolerances).errors for epoch in range(2)]
-    trials = rt.draw_errors(built.tolerances, 24, BUILT.seed)
+    trials = rt.tolerancing.draw_errors(built.tolerances, 24, BUILT.seed)
     assert torch.equal(torch.cat(every), trials)
     some = batch(pictures, BUILT, [7, 3], 1, built.tolerances)
     assert torch.equal(some.errors, trials[[19, 15]])
@@ -207,7 +211,7 @@ def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pict
     found = errors_as_built(built, pictures, settings)
     assert [len(part) for part in found] == [count, count]
     samples = batch(pictures, settings, list(range(4)), TEST_EPOCH)
-    drawn = rt.draw_errors(built.tolerances, count, first=2**62)
+    drawn = rt.tolerancing.draw_errors(built.tolerances, count, first=2**62)
     assert len({tuple(row) for row in drawn.tolist()}) == count
     with torch.no_grad():
         for number in range(count):
@@ -233,24 +237,24 @@ def test_grades_of_the_settings_are_those_of_tolerancing():
 def test_wrong_cameras_as_built_are_refused(lens):
     variables, tolerances = rt.Variables(lens, "sensor"), rt.tolerances(lens, grade="precision")
     gap = dataclasses.replace(tolerances, compensators=(Compensator(5),))
-    absent = dataclasses.replace(tolerances, rows=(rt.Tolerance("thickness", (40,), -1, 1),))
+    absent = dataclasses.replace(tolerances, rows=(rt.system.Tolerance("thickness", (40,), -1, 1),))
     for change, error, words in (
         ({"center": "middle"}, ValueError, "center 'middle': expected chief or centroid"),
         ({"tolerances": gap}, rt.BadTolerance, "adjusted by its sensor distance alone, the thickness of surface 11"),
         ({"tolerances": absent}, rt.BadTolerance, "thickness of surface 40: this lens has surfaces 0 to 11"),
         ({"tolerances": tolerances, "model": "paraxial"}, ValueError, "'paraxial' traces no rays of a lens as built"),
         (
-            {"center": "centroid", "model": rt.Gaussian(rays=torch.zeros(2, 3))},
+            {"center": "centroid", "model": rt.psf_models.Gaussian(rays=torch.zeros(2, 3))},
             ValueError,
             "pupil points are about the chief ray",
         ),
     ):
         with pytest.raises(error, match=words):
-            rt.Camera(variables, rt.RedNet(), **change)
+            rt.Camera(variables, rt.imaging.RedNet(), **change)
     errors = torch.zeros(3, len(tolerances), dtype=torch.float64)
     with pytest.raises(ValueError, match="errors, but no tolerances: give Camera"):
-        rt.Camera(variables, rt.RedNet()).kernels(DISTANCES, 0, errors)
-    built = rt.Camera(variables, rt.RedNet(), tolerances=tolerances)
+        rt.Camera(variables, rt.imaging.RedNet()).kernels(DISTANCES, 0, errors)
+    built = rt.Camera(variables, rt.imaging.RedNet(), tolerances=tolerances)
     with pytest.raises(rt.BadTolerance, match=r"expected \(79,\), an error for each row"):
         built.kernels(DISTANCES, 0, errors[:, :5])
     with pytest.raises(ValueError, match="errors of 3 lenses at 2 object distances"):

@@ -153,7 +153,7 @@ def test_experiment_starts_where_it_is_asked():
     assert by_start["rms"].wavelengths.tolist() == [float(wavelength)]
     slow = lens_at_start(lens, CodesignSettings(f_number=5.0))
     assert slow.aperture.kind == "image_f_number"
-    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms, spectral, gaussian or a "):
+    with pytest.raises(ValueError, match="'middle': expected paraxial, rms, spectral, gaussian"):
         lens_at_start(lens, CodesignSettings(start="middle"))
 
 
@@ -326,7 +326,7 @@ def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     own = camera(read_lens(LENS), settings)
     optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert own.variables.numbers()["sensor"] == pytest.approx(57.88, abs=1e-9)
-    with pytest.raises(BadVariables, match="`bounds` for thickness_5, not among the variables"):
+    with pytest.raises(BadVariables, match="`bounds` for thickness_5, not among"):
         camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
 
 
@@ -387,7 +387,7 @@ def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
 def test_a_telescope_too_near_its_object_has_no_image_to_be_learned():
     """10 to 50 m lie within a focal length of 57.6 m."""
     lens = read_lens(shipped("lenses") / "hubble.zmx")
-    with pytest.raises(NoImage, match=r"no real image of an object at 10000 mm: it lies within the focal length"):
+    with pytest.raises(NoImage, match=r"no real image .*10000 mm"):
         lens_at_start(lens, CodesignSettings())
     far = dataclasses.replace(CodesignSettings(), near=1e8, far=1e9, focus_distance=2e8)
     assert float(lens_at_start(lens, far).surfaces[-2].thickness) > 6406

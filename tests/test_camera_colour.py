@@ -247,7 +247,7 @@ def test_pictures_of_half_precision_are_blurred_in_float32(triplet):
     assert image.dtype == torch.float32
     torch.testing.assert_close(image, one.image(picture.half().float(), distances, points=points))
     for convert in (torch.nn.Module.half, torch.nn.Module.bfloat16):
-        with pytest.raises(ValueError, match=r"dtype torch\.b?float16: expected torch\.float32 or torch\.float64"):
+        with pytest.raises(ValueError, match=r"torch\.b?float16: expected torch\.float32"):
             convert(one)
 
 
@@ -255,7 +255,7 @@ def test_distances_are_numbers_of_any_kind_and_one_at_least(triplet):
     one, points = made(triplet), torch.zeros(2, 1)
     torch.testing.assert_close(one.kernels(1e4, points=points), one.kernels(torch.tensor([1e4]), points=points))
     for distances in ([], torch.zeros(0), torch.full((2, 2), 1e4)):
-        with pytest.raises(ValueError, match=r"object_distances of shape .*: expected \(B,\) mm"):
+        with pytest.raises(ValueError, match=r"object_distances .*expected \(B,\) mm"):
             one.kernels(distances, points=torch.zeros(2, 0))
 
 
@@ -329,13 +329,13 @@ def test_a_state_describes_its_camera_and_loads_into_no_other(triplet):
     assert set(described["versions"]) == {"raytrace", "torch"}
     assert set(described["variables"]) == {"sensor", "curvature_1", "curvature_6"}
     made(triplet).load_state_dict(state)
-    with pytest.raises(OtherLens, match=r"of a sensor of full_well 20000\.0, not 30000\.0"):
+    with pytest.raises(OtherLens, match=r"full_well 20000\.0, not 30000\.0"):
         made(triplet, sensor=dataclasses.replace(SENSOR, full_well=3e4)).load_state_dict(state)
     with pytest.raises(OtherLens, match=r"of a camera of window \[11, 11"):
         made(triplet, pixels=13).load_state_dict(state)
     with pytest.raises(OtherLens, match="the state is of"):
         made(rt.read_lens("tessar"), "sensor curvature:1,6").load_state_dict(state)
-    with pytest.raises(OtherLens, match="the variables sensor, curvature_1, curvature_6, not sensor"):
+    with pytest.raises(OtherLens, match="sensor, curvature_1, curvature_6, not sensor"):
         made(triplet, "sensor").load_state_dict(state)
 
 
@@ -349,7 +349,7 @@ def test_a_state_of_an_older_version_loads(triplet):
 
 def test_optics_and_network_have_rates_of_their_own(triplet):
     one = made(triplet)
-    one.network = rt.UNet(channels=3, levels=1, width=4)
+    one.network = rt.imaging.UNet(channels=3, levels=1, width=4)
     optimizer = torch.optim.SGD(one.rates(optics=1e-3, network=1e-1))
     assert [group["lr"] for group in optimizer.param_groups] == [1e-3, 1e-1]
     assert sum(len(group["params"]) for group in optimizer.param_groups) == len([*one.parameters()])
@@ -408,9 +408,9 @@ def test_joint_filters_leave_less_error_of_correlated_colours(triplet, pictures)
     filters = field_filters(one, joint, (0.0, 1.0), distances)
     assert filters.shape == (2, 3, 3, 26, 26)
     assert 0 < held_out_error(one, pictures[1], SETTINGS, place=1.0, filters=filters[1]) < 0.3
-    with pytest.raises(ValueError, match="joint filters are those of the colours of a sensor"):
+    with pytest.raises(ValueError, match=r"joint filters .*sensor"):
         spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="joint", sensor=()))
-    with pytest.raises(ValueError, match="filters 'both': expected separate or joint"):
+    with pytest.raises(ValueError, match="'both': expected separate or joint"):
         spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="both"))
 
 

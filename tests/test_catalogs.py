@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 from problems import for_examples
+from problems_zemax import SMALL
 
 import raytrace as rt
 from raytrace.materials import agf, catalogs
@@ -82,24 +83,6 @@ COARSE = (
     "330R 480R CAFK95 EDMUND_REPLICA_POLYMER_152V52 K-CAFK95 K-CAFK95(M) K-CSK120 K-FIR100UV K-FIR100UV(M) K-LAKN5 "
     "K-LASFN21 K-PFK80 K-PFK80(M) K-PSFN1 K-PSFN1(M) K-PSFN214(M) K-VC89 K-VC91 PFK80 ZEONEX_K22R&K26R_2017 ZEONEX_K26R"
 )
-
-SMALL = """CC A catalog for tests: Prüfgläser
-! a note on statuses
-NM ONE 2 517642.251 1.516800 64.17 0 1 1
-GC the first; alternatives: TWO, THREE
-ED 7.1 8.3 2.51 -0.0009 0
-CD 1.03961212E+000 6.00069867E-003 2.31792344E-001 2.00179144E-002 1.01046945E+000
-1.03560653E+002 0 0 0 0
-TD 1.86E-006 1.31E-008 -1.37E-011 4.34E-007 6.27E-010 1.70E-001 2.0E+001
-OD 1.0 2.0 - 1.0 2.3 _
-LD 3.00000000E-001 2.50000000E+000
-IT 3.00E-001 5.0E-002 2.5E+001
-IT 5.00E-001 9.98E-001 2.5E+001
-
-NM Two 1 620603 1.620409 60.280874 0 2 -1
-CD 2.592001 -0.01540969 0.0102268 0.001581559 -0.0001877149 1.012515e-05 0 0 0 0
-LD 0.4 0.7
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -192,7 +175,7 @@ def test_catalogs_are_searched_in_the_order_of_the_lens_file():
 
 
 def test_a_name_of_two_glasses_is_reported_unless_the_lens_file_decides():
-    with pytest.warns(AmbiguousGlass, match=r"lens\.csv:3: SK2 is taken from SCHOTT.*HIKARI by 3\.\de-05"):
+    with pytest.warns(AmbiguousGlass, match=r"lens\.csv:3: SK2 .*SCHOTT.*HIKARI by 3\.\de-05"):
         assert find_glass("SK2", where="lens.csv:3").catalog == "SCHOTT"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -409,7 +392,7 @@ def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
 def test_binary_and_damaged_files(tmp_path):
     path = tmp_path / "bad.agf"
     path.write_bytes(b"NM A\nPK\x03\x04" + bytes(range(256)) * 9)
-    with pytest.raises(CatalogError, match=r"bad\.agf:2: found binary data \(byte 0x03\)"):
+    with pytest.raises(CatalogError, match=r"bad\.agf:2: .*byte 0x03"):
         read_agf(path)
     path.write_bytes(SMALL.encode("utf-16")[:501])
     with pytest.raises(CatalogError, match=r"damaged UTF-16 text.*cut off"):
@@ -427,10 +410,10 @@ def test_a_file_too_large_is_refused_before_it_is_read(tmp_path):
 def test_ignored_data_are_reported(tmp_path):
     path = tmp_path / "odd.agf"
     path.write_text(SMALL + "QX 1 2 3\n")
-    with pytest.warns(CatalogWarning, match=r"odd\.agf: left aside lines that begin with 'QX' \(line 17\)"):
+    with pytest.warns(CatalogWarning, match=r"odd\.agf: .*'QX' \(line 17\)"):
         assert len(read_agf(path).glasses) == 2
     path.write_text(SMALL.replace("NM Two", "NM ONE"))
-    with pytest.warns(CatalogWarning, match=r"odd\.agf:14: ONE is defined again; the first"):
+    with pytest.warns(CatalogWarning, match=r"odd\.agf:14: ONE .*again; the first"):
         assert read_agf(path).glasses["ONE"].nd_listed == 1.5168
 
 
@@ -530,7 +513,7 @@ def test_what_has_no_nd_and_vd_has_no_nearest_glass():
         nearest_glasses(constant(1.5))
     with pytest.raises(ValueError, match="a mirror has no refractive index"):
         nearest_glasses(MIRROR)
-    with pytest.raises(CatalogError, match="no catalog 'OHARRA' is shipped; there are SCHOTT, OHARA"):
+    with pytest.raises(CatalogError, match=r"'OHARRA' .*SCHOTT, OHARA"):
         nearest_glasses("N-BK7", catalogs=["OHARRA"])
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_stores import STRANGE, put
+from problems_stores import STRANGE, put
 
 import raytrace as rt
 from raytrace import stores
@@ -104,7 +104,7 @@ OTHERS = {
     "another lens: .* thickness 12.93 of surface 2, not 13": (TRIPLET.replace(2, thickness=13.0), {}),
     "other conditions": (TRIPLET.at(fields=[0.0, 7.0]), {}),
     "other variables: .*; expected thickness_1 among them": (TRIPLET, {"vary": "curvature:1-4 sensor thickness:1"}),
-    "other merit": (TRIPLET, {"merit": rt.DefaultMerit("spot", rings=4)}),
+    "other merit": (TRIPLET, {"merit": rt.optimization.DefaultMerit("spot", rings=4)}),
     "other hold": (TRIPLET, {"hold": "efl=100"}),
     "other paths": (TRIPLET, {"paths": 2}),
     "other bounds": (TRIPLET, {"bounds": "sensor:70..90"}),
@@ -130,7 +130,7 @@ def test_a_checkpoint_of_an_older_version_is_refused(kept, tmp_path):
     document = json.loads(kept.read_text())
     path = tmp_path / "old.json"
     path.write_text(json.dumps({key: document[key] for key in ("merit", "cycles", "variables")}))
-    with pytest.raises(BadCheckpoint, match=r"old.json: has no identity \('of'\); an older version wrote it"):
+    with pytest.raises(BadCheckpoint, match=r"old.json: .*older version"):
         rt.optimize(TRIPLET, resume=path, merit="spot", vary="curvature:1-4 sensor")
 
 
@@ -188,7 +188,7 @@ def test_a_checkpoint_that_cannot_be_written_ends_nothing(tmp_path, monkeypatch)
         raise OSError(28, "No space left on device", str(path))
 
     monkeypatch.setattr(stores, "write_json", full)
-    with pytest.warns(rt.files.NotWritten, match=r"kept.json: No space left on device; the optimisation continues"):
+    with pytest.warns(rt.files.NotWritten, match=r"kept.json: No space left.*continues"):
         found = rt.optimize(TRIPLET, checkpoint=tmp_path / "kept.json", **SPOT | {"cycles": 2})
     assert found.cycles == 2
 

@@ -172,7 +172,7 @@ def test_info_prints_infinite_or_a_dash_where_a_quantity_is_undefined(run):
     (line,) = (line for line in touching.splitlines() if line.strip().startswith("magnification"))
     lens = rt.read_lens("touching.zmx")
     stop, front, back = lens.surfaces[1:4]
-    n = float(rt.refractive_index(front.glass, lens.primary))
+    n = float(rt.materials.refractive_index(front.glass, lens.primary))
     reach = float(stop.thickness) + float(front.thickness) / n
     enlarged = 1 / (1 - (1 - n) * float(back.curvature) * reach)  # of an object on the stop, in front of a flat face
     assert float(line.split()[1]) == pytest.approx(enlarged, rel=1e-8)

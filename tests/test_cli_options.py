@@ -1,12 +1,16 @@
 """Options of the commands: one name has one meaning; options with several values; suggestions for misspelt options."""
 
 import argparse
+import ast
 import csv
 import inspect
 import io
 import json
 import math
 import re
+import subprocess
+import sys
+import typing
 from collections import defaultdict
 from pathlib import Path
 
@@ -17,16 +21,20 @@ import torch
 
 import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
-from raytrace.cli import build_parser
-from raytrace.cli.commands import COMMANDS
-from raytrace.cli.parameters import entries, parameters_of
-from raytrace.cli.run import find_lens
+from raytrace.cli import build_parser, options
+from raytrace.cli.commands import COMMANDS, WAVE_COMMANDS
+from raytrace.cli.run import RUNNER_OPTIONS, find_lens
 from raytrace.cli.types import PICTURES, picture_file
+from raytrace.imaging.sensor import PATTERNS
 from raytrace.io import read_lens
+from raytrace.io.pictures import read_depth
 from raytrace.maths.sampling import hexapolar
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_of_options
+from raytrace.psf_models import MODELS, Execution
+from raytrace.tolerancing.grades import GRADES
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
 from raytrace.tracing.spot import arrivals
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, in_command, option, with_options
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
@@ -65,9 +73,9 @@ def test_an_option_means_the_same_everywhere():
     forms = defaultdict(lambda: defaultdict(list))
     for name, parser in PARSERS.items():
         for action in parser._actions:
-            for option in action.option_strings:
-                if option.startswith("--"):
-                    forms[option][action.type, action.metavar, action.nargs].append(name)
+            for flag in action.option_strings:
+                if flag.startswith("--"):
+                    forms[flag][action.type, action.metavar, action.nargs].append(name)
     different = {option: dict(found) for option, found in forms.items() if len(found) > 1}
     assert set(different) == set(DIFFERENT)
 
@@ -81,7 +89,7 @@ def test_data_pixels_and_figures_have_their_own_options(name):
         wrong, said = ("x.pdf", "ends in .png") if name == "render" else ("x.png", "is a picture: figures are saved by")
         with pytest.raises(argparse.ArgumentTypeError, match=said):
             known["-o"].type(wrong)
-    if "--size" in known:
+    if "--size" in known and known["--size"].help != argparse.SUPPRESS:
         assert known["--size"].help.startswith("pixels across")
     if "--plot" in known:
         assert known["--plot"].type is picture_file
@@ -325,37 +333,109 @@ def test_axes_do_not_magnify_rounding(tmp_path):
     assert off_line.plot().axes[0].lines[0].get_marker() == "o"  # few fields: points are seen
 
 
-# -- options from signatures ------------------------------------------------------------------------------------------
+# -- the table of options and the functions ----------------------------------------------------------------------------
+
+#: Parameters without an option, and why.
+NO_OPTION = {
+    **dict.fromkeys(("progress", "watch", "share"), "given by the runner"),
+    **dict.fromkeys(("path", "catalogs"), "files, by LENS and --catalog"),
+    **dict.fromkeys(("lens", "pupil", "grid", "elements", "tolerances"), "an object; LENS is the lens"),
+    **dict.fromkeys(("execution", "as_built", "merit"), "an object, whose fields have options"),
+    "window": "the kernels of a picture of the whole field, in Python",
+}
+#: Functions whose parameters are options of a command, by a parameter of its public function that holds them.
+PARTS = {
+    "merit": (merit_of_options, DefaultMerit, Merit.of),
+    "as_built": (rt.tolerancing.AsBuilt,),
+    "sensor": (rt.Sensor, rt.Sensor.capture, read_depth),
+    "model": (rt.psf_models.DRT, rt.psf_models.Paraxial),
+    "execution": (Execution,),
+}
+#: Options of the runner of one command.
+OF_ONE_RUN = {"render": {"png_bits", "raw"}}
+
+VERBS = [command for command in (*COMMANDS, *WAVE_COMMANDS) if command.verb in rt.PUBLIC]
 
 
-@pytest.mark.parametrize("command", [command.name for command in COMMANDS if command.verb in rt.PUBLIC])
-def test_parameters_read_from_the_source_are_those_of_the_function(command):
-    verb = command.replace("-", "_")
-    expected, read = inspect.signature(rt.public_name(verb)).parameters, parameters_of(verb)
-    assert [*read] == [*expected]
-    for name, parameter in read.items():
-        if parameter.default is not None:  # one that is no constant in the source is not read
-            assert parameter.default == expected[name].default
-
-
-def test_entries_of_a_docstring_are_help_texts():
-    text = """A sum.
-
-    first, second: numbers, of `first` more
-    often. The rest is no help. third: "a" or "b";
-    fourth: mm."""
-    assert entries(inspect.cleandoc(text), ["first", "second", "third", "fourth"]) == {
-        **dict.fromkeys(("first", "second"), "numbers, of --first more often"),
-        "third": "a or b",
-        "fourth": "mm",
-    }
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_option_has_a_help_text(command):
+def rows(command):
+    """The actions of a command by their destination, help aside."""
     parser = argparse.ArgumentParser(add_help=False)
-    command.add_arguments(parser)
-    assert all(action.help for action in parser._actions if not isinstance(action, argparse._SubParsersAction))
+    options.add(parser, command.options)
+    return {action.dest: action for action in parser._actions}
+
+
+def parameters(*functions):
+    return {name for function in functions for name in inspect.signature(function).parameters}
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_options_are_the_parameters_of_the_function(command):
+    keywords, actions = inspect.signature(rt.public_name(command.verb)).parameters, rows(command)
+    parts = {name for part, functions in PARTS.items() if part in keywords for name in parameters(*functions)}
+    names = {name for name in actions if not name.startswith("plot_")} - OF_ONE_RUN.get(command.name, set())
+    assert names - {*RUNNER_OPTIONS} <= {*keywords} | parts
+    assert {*keywords} - {*actions} <= {*NO_OPTION}
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_defaults_of_options_are_those_of_the_function(command):
+    actions = rows(command)
+    for name, parameter in inspect.signature(rt.public_name(command.verb)).parameters.items():
+        if name in actions and name not in RUNNER_OPTIONS:
+            default, stated = parameter.default, actions[name].default
+            if stated is None and default not in (None, inspect.Parameter.empty):  # the function's own
+                assert "default" in actions[name].help or name in ("fields", "wavelengths"), name
+            elif stated is not None:
+                assert stated == default, name
+
+
+def test_choices_are_the_rows_of_the_tables_of_the_package():
+    assert (*MODELS,) == options.MODELS
+    assert (*GRADES,) == options.GRADES
+    by_name = {command.name: rows(command) for command in COMMANDS}
+    assert by_name["optimize"]["merit"].choices == (*KINDS,)
+    assert by_name["render"]["mosaic"].choices == ("none", *PATTERNS)
+
+
+def literals(annotation):
+    """The choices of an annotation Literal[…], also within a union."""
+    parts = typing.get_args(annotation)
+    return parts if typing.get_origin(annotation) is typing.Literal else sum(map(literals, parts), ())
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_choices_are_those_of_the_annotation(command):
+    actions = rows(command)
+    for name, parameter in inspect.signature(rt.public_name(command.verb)).parameters.items():
+        if name in actions and (choices := literals(parameter.annotation)):
+            assert (*actions[name].choices,) == choices, name
+
+
+def test_the_command_line_reads_no_source_and_imports_no_function():
+    """No docstring or annotation can change a command: the modules of the functions are neither loaded nor read."""
+    code = """
+import builtins, io, pathlib, sys
+from raytrace import cli
+from raytrace.cli import commands
+builtins.open = io.open = pathlib.Path.read_text = None
+cli._version = str
+cli.build_parser()
+print(*sorted(name for name in sys.modules if name.startswith("raytrace.") and not name.startswith("raytrace.cli.")))
+"""
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert loaded == ["raytrace.budget", "raytrace.cli", "raytrace.files", "raytrace.settings", "raytrace.words"]
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, *WAVE_COMMANDS], ids=lambda command: command.name)
+def test_every_option_has_a_help_text(command):
+    assert all(action.help for action in rows(command).values())
+
+
+def test_the_viewer_opens_a_lens_at_an_object_distance(command, monkeypatch):
+    lenses = []
+    monkeypatch.setattr("raytrace.viewer.server.serve", lambda lens, **options: lenses.append(lens))
+    assert command("view", "double_gauss", "--object-distance", 500) == (0, "", "")
+    assert float(lenses[0].surfaces[0].thickness) == 500
 
 
 def test_options_of_other_commands_are_not_built():
@@ -375,3 +455,36 @@ def test_the_table_of_an_analysis_is_written_by_o(command):
     assert [float(row["S1"]) for row in rows] == expected["S1"].tolist()
     assert command("distortion", "singlet", "--field", "1", "-o", "distortion.json")[0] == 0
     assert json.loads(Path("distortion.json").read_text()) == rt.distortion("singlet", fields=[1]).document()
+
+
+def test_an_option_is_named_as_its_reader_writes_it():
+    assert option("ray_aiming", "real") == "`ray_aiming=real`"
+    with in_command({"ray_aiming": "--ray-aiming", "fields": "--field"}):
+        assert option("ray_aiming", "real") == "--ray-aiming real"
+        assert option("fields") == "--field"
+        assert option("tol", 0.1) == "`tol=0.1`"  # not an option of that command
+        assert with_options("fewer {fields}, {ray_aiming=off}") == "fewer --field, --ray-aiming off"
+    assert option("fields") == "`fields`"
+
+
+def sentences(tree):
+    """Texts of a module, docstrings aside, with their lines."""
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value, node.lineno
+
+
+def test_messages_name_options_by_a_function():
+    """`words.option("fields")` is --field in a command, and `fields` in Python."""
+    package, names = Path(rt.__file__).parent, {name for command in COMMANDS for name in rows(command)}
+    others = ("cli/commands.py", "optimization/operands/", "imaging/camera.py", "io/__init__.py", "bench/")
+    offenders = [
+        f"{path.relative_to(package)}:{line}: `{word}`"
+        for path in sorted(package.rglob("*.py"))
+        if not str(path.relative_to(package)).startswith(others)
+        for text, line in sentences(ast.parse(path.read_text("utf-8")))
+        for word in re.findall(r"`(\w+)(?:=[^`]*)?`", text)
+        if word in names
+    ]
+    assert not offenders, "\n".join(offenders)

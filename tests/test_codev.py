@@ -9,7 +9,8 @@ import pytest
 import torch
 from hypothesis import strategies as st
 from problems import NANOMETRE, for_examples, number
-from test_formats import damaged, leaves, read_damaged
+from problems_codev import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS, sequence
+from problems_files import damaged, leaves, read_damaged
 
 import raytrace as rt
 from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
@@ -35,114 +36,15 @@ def again(lens: Lens) -> Lens:
     return of(FORMATS[".seq"].write(lens, "lens.seq").decode())[0]
 
 
-def sequence(surfaces: str, system: str = "EPD 10;WL 587.6;YAN 0", mode: str = "RDM") -> str:
-    return f"{mode};LEN\nDIM M\n{system}\nSO 0 1e14\n{surfaces}\nSI 0 0\nGO\n"
-
-
 SINGLET = sequence("S 50 4 NBK7_SCHOTT\nSTO\nS -50 48")
 
 
-#: Every command that is read, once at least.
-EVERYTHING = """RDM;LEN NEW
-TITLE 'a lens'; INI 'xy'
-!raytrace note "of two words"
-!raytrace catalogs SCHOTT OHARA
-!raytrace aiming real
-AFI NO
-!raytrace unnamed MEDIUM1
-NAO 0.01; DIM I; TEM 20; PRE 760; CA YES; PUI 1; PUX 1; PUY 1; TEL NO
-WL 656.3 587.6 &
- 486.1
-REF 2; WTW 1 2 1; WTW W1 0.5
-XOB 0 0; YOB 0 0.1; WTF 1 1
-VUX 0 0.1; VLX 0 0.1; VUY 0 0.2; VLY F2 0.3
-PRV
-PWL 656.3 587.6 486.1
-'E48' 1.5286 1.53116 1.5378
-'MEDIUM1' 1.3 1.3 1.3
-'NOA61' LAU 2.36390625 0 0.025493134 -0.000580235
-END
-SO 0 20
-S1 2 0.3 'E48'; SLB 'first'
-  SPH
-  CIR 0.5; ADX 0.01; ADY 0.01; ARO 0
-  CIR OBS L'A' 0.05; CIR EDG 0.6
-S -2 0.1 MEDIUM1
-  CON; K -1; CUF 0
-  REX 0.4; REY 0.4
-S 0 0.2 517.642
-  STO
-  ELX 0.4; ELY 0.4
-S 3 0.2 NBK7_SCHOTT; RDY S4 3.1
-  ASP; K 0.1; A 1e-3; B 1e-4; C 1e-4; D 1e-5; E 1e-5; F 1e-5; G 1e-5; H 1e-5; J 1e-6
-  DIF DOE; HOR 1; HWL 587.6; HCT R; HCO C1 -0.0001; HCO C2 1e-6
-  !raytrace radius 0.7
-  XDE 0.001; YDE 0.001; ZDE 0.001; ADE 0.1; BDE 0.1; CDE 0.1; DAR
-S 0 1 NOA61; THI S5 1.1; GLA S5 F5; CUY S5 0.0
-  ADE 1; REV
-S 0 -1 F5 REFL
-  ADE 10; BEN
-S 0 -2; RMD REFR
-SI 0 0
-ZOO 2; ZOO THI S7 -2.1 -2.2; TIT Z2 'b'
-PIM NO
-GO
-"""
-
 # -- figures that CODE V stored: the distance of the paraxial image, to which PIM had put the image --------------------
 
-DOUBLE_GAUSS = """RDM N;LEN
-TITLE 'Double Gauss F/2'
-EPD 50
-DIM M
-WL 656.3 587.6 486.1
-REF 2
-YAN 0 10.0000000023 14.0000000032
-VUY 0 0.2 0.4
-VLY 0 0.25 0.4
-SO 0 993938392063
-S 0.01779284094091543 8.75 NSSK2_SCHOTT
-S 0.006566600536925569 0.5
-S 0.02653743294670983 12.5 NSK2_SCHOTT
-S 0 3.8 F5_SCHOTT
-S 0.04126892878570084 16.36944492653564
-S 0 13.74795696388906
-STO
-S -0.03523942654429074 3.8 F5_SCHOTT
-S 0 11 NSK16_SCHOTT
-S -0.02636750828657709 0.5
-S 0.005636604951748545 7 NSK16_SCHOTT
-S -0.0125926458590576 61.4875364179821
-{}
-SI 0 {}
-"""  # ray-optics, ag_dblgauss.seq: saved by CODE V 10.7
 
-QUESTAR = """RDM N;LEN
-EPD 3.503937007874016
-DIM I
-WL 650 555 450
-REF 2
-YAN 0 0.25
-SO 0 1e11
-S -0.2779672329376499 0.2841750104821051 NBK7_SCHOTT
-S -0.2656588696905559 6.617998801804411
-CIR OBS L'A' 0.3825432833412954
-S -0.06219776663591262 -6.617998801804411 REFL
-STO
-S -0.2656588696905559 10.21528463036717 REFL
-PIM
-SI 0 0
-"""  # ray-optics, questar35.seq: saved by CODE V 10.7, in inches
-
-ACHROMAT = sequence("S 61.47 6 NBK7_SCHOTT\nSTO\nS -44.64 2.5 NSF5_SCHOTT\nS -129.94 95.95194415183156\nPIM")
 SMALL = sequence(
     "S 0.8 0.5 NPSK53A_SCHOTT\nSTO\nS -0.8 0.5 NLASF9_SCHOTT\nS -4.5 0.9176749924408083\nPIM", "EPD 0.4;WL 587.6"
 )
-ASPHERE = sequence(
-    "S 19.38 9.720976918833829 NBK7_SCHOTT\nSTO\nASP\nK -0.6698934\nCUF 0.0\nA 0.1876737e-5; B 0.8930244e-9; C 0; D 0\n"
-    "S 0 31.09123483490374\nPIM",
-    "EPD 25;WL 587.6;XAN 0;YAN 0",
-)  # Edmund Optics 32327, 65564 and 16998
 
 
 def test_an_afocal_image_space_is_read_and_written():
@@ -191,32 +93,6 @@ def test_the_thickness_of_the_image_is_the_defocus_that_sharpens_it():
 
 
 # -- decentres and tilts ----------------------------------------------------------------------------------------------
-
-THREE_MIRRORS = """tit 'F/4.0, 4x4 deg., 3 Mirror Compact'
-rdm y
-SO 0 1e11
-S 0 300
-S -1058.98937 -276.006853 REFL
-CON; K -1.314566
-DAR; YDE 48.695345; ADE 8.438645
-REX 75.734236; REY 78.538674; ADY 99.602384
-S 0 -0.981318; STO
-DAR; YDE 11.444717; ADE 10.219900
-S -324.06500 319.160560 REFL
-CON; K 0.889123
-DAR; YDE 17.561821; ADE 9.661580
-REX 24.789115; REY 24.791683; ADY -6.213535
-S -453.96516 -321.621031 REFL
-ASP; K 0.226106; A 0.368950E-10
-DAR; YDE 67.500535; ADE 9.514418
-REX 66.581268; REY 65.453521; ADY -112.354230
-SI 0 15.407921
-YDE -47.681342; ADE 8.716957
-EPD 100; DIM MM; WL 500; REF 1
-XAN 0 0 0 2 2
-YAN 2 0 -2 -2 2
-PIM
-"""  # ray-optics, threemir.seq
 
 
 def bundle(x: float, y: float, field: tuple[float, float], radius: float, count: int) -> Rays:

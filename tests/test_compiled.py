@@ -247,7 +247,7 @@ def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
         assert engine() == "eager"
         assert not uses_compiled(rays, number, 10**9)
         assert prepare() == "eager"
-    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, compiled"), trace_engine("quick"):
+    with pytest.raises(ValueError, match=r"'quick': .*auto, eager, compiled"), trace_engine("quick"):
         pass
 
 

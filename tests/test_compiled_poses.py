@@ -42,12 +42,12 @@ def drawn(*shape: int, size: float = 1.0, seed: int = 5) -> torch.Tensor:
     return size * torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
-GRATING = rt.Grating(scalar(0.15), scalar(1.0))
-RADIAL = rt.RadialPhase(vector(-40.0, 12.0, 3.0), scalar(10.0), scalar(1.0))
-FREE = rt.PolynomialPhase(drawn(14, size=60.0), scalar(20.0), scalar(-1.0))
-FRINGE = rt.FringePhase(drawn(37, size=0.5), scalar(30.0), scalar(1.0))
-HOLOGRAM = rt.Hologram(vector(3.0, -2.0, -40.0), vector(-5.0, 4.0, 60.0), scalar(0.55), scalar(1.0))
-ROUND, UNLIKE = (rt.IdealLens(scalar(0.01), scalar(power), scalar(0.002)) for power in (0.01, -0.004))
+GRATING = rt.system.Grating(scalar(0.15), scalar(1.0))
+RADIAL = rt.system.RadialPhase(vector(-40.0, 12.0, 3.0), scalar(10.0), scalar(1.0))
+FREE = rt.system.PolynomialPhase(drawn(14, size=60.0), scalar(20.0), scalar(-1.0))
+FRINGE = rt.system.FringePhase(drawn(37, size=0.5), scalar(30.0), scalar(1.0))
+HOLOGRAM = rt.system.Hologram(vector(3.0, -2.0, -40.0), vector(-5.0, 4.0, 60.0), scalar(0.55), scalar(1.0))
+ROUND, UNLIKE = (rt.system.IdealLens(scalar(0.01), scalar(power), scalar(0.002)) for power in (0.01, -0.004))
 
 #: Each is entered by rays of a wide cone; between them stand all kinds, mirrors, breaks, and rays lost in every way.
 SYSTEMS = {
@@ -87,9 +87,9 @@ SYSTEMS = {
         surface(None, -7.0, sag_terms=TiltSag(scalar(0.1), scalar(-0.2)), phase=GRATING),
     ],
     "facets": [
-        surface(0.03, 5.0, 1.6, phase=rt.Facets(), conic=-0.5),
-        surface(-0.02, 8.0, coefficients=[1e-3, 2e-5, -1e-7], phase=rt.Facets(), before=posed(tilt_x=9.0)),
-        surface(None, 8.0, 1.5, phase=rt.Facets()),
+        surface(0.03, 5.0, 1.6, phase=rt.system.Facets(), conic=-0.5),
+        surface(-0.02, 8.0, coefficients=[1e-3, 2e-5, -1e-7], phase=rt.system.Facets(), before=posed(tilt_x=9.0)),
+        surface(None, 8.0, 1.5, phase=rt.system.Facets()),
     ],
     "ideal": [
         surface(None, 12.0, phase=ROUND),
@@ -99,8 +99,8 @@ SYSTEMS = {
         surface(None, -14.0, phase=ROUND, after=posed(tilt_y=4.0)),
     ],
     "evanescent": [
-        surface(None, 3.0, phase=rt.Grating(scalar(1.7), scalar(1.0))),
-        surface(None, 2.0, phase=rt.Grating(scalar(1.7), scalar(-1.0)), before=posed(tilt_x=10.0)),
+        surface(None, 3.0, phase=rt.system.Grating(scalar(1.7), scalar(1.0))),
+        surface(None, 2.0, phase=rt.system.Grating(scalar(1.7), scalar(-1.0)), before=posed(tilt_x=10.0)),
         surface(0.02, 2.0, 1.5),
     ],
 }
@@ -241,7 +241,7 @@ def test_whether_an_order_is_evanescent_is_not_left_to_rounding(glass):
     n2 = glass if isinstance(glass, float) else 1.0
     sine = torch.linspace(-2e-6, 2e-6, 801, dtype=torch.float64) + n2 - 0.8
     rays = start(torch.zeros(3, 801), torch.stack([0 * sine, sine, torch.sqrt(1 - sine * sine)]).float(), None)
-    grating = surface(None, 0.0, glass, phase=rt.Grating(scalar(1.6), scalar(1.0)))
+    grating = surface(None, 0.0, glass, phase=rt.system.Grating(scalar(1.6), scalar(1.0)))
     grating = to(grating, dtype=torch.float32)
     n = [torch.tensor(1.0), torch.tensor(n2)]
     found = both(lambda: trace_surfaces([grating], rays, indices=n, wavelength=torch.tensor(0.5)).valid)
@@ -335,11 +335,11 @@ def test_gradients_are_differences_and_have_gradients_of_their_own(order):
     def trace(frequency, radius, terms, power, *angles):
         tilt = Pose(**dict(zip(names, angles, strict=True)))
         surfaces = [
-            surface(0.02, 3.0, 1.5, before=tilt, phase=rt.Grating(frequency, scalar(1.0)), after=tilt),
-            surface(-0.01, 4.0, 1.6, phase=rt.RadialPhase(terms, radius, scalar(1.0))),
+            surface(0.02, 3.0, 1.5, before=tilt, phase=rt.system.Grating(frequency, scalar(1.0)), after=tilt),
+            surface(-0.01, 4.0, 1.6, phase=rt.system.RadialPhase(terms, radius, scalar(1.0))),
             broken(0.0, tilt_y=4.0),
-            surface(None, 5.0, MIRROR, phase=rt.PolynomialPhase(10 * terms, radius, scalar(1.0))),
-            surface(None, -8.0, phase=rt.IdealLens(power, power, 0.5 * power)),
+            surface(None, 5.0, MIRROR, phase=rt.system.PolynomialPhase(10 * terms, radius, scalar(1.0))),
+            surface(None, -8.0, phase=rt.system.IdealLens(power, power, 0.5 * power)),
             surface(None, before=Pose(tilt_x=angles[0])),
         ]
         n = [scalar(1.0), scalar(1.5), scalar(1.6)]

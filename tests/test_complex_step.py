@@ -84,7 +84,7 @@ def by_torch(of, position, direction, weights, engine):
     ]
     rays = start(torch.tensor(position), torch.tensor(direction), zero)
     indices = [*leaves["index"].unbind(), leaves["index"][-1]]
-    with rt.trace_engine(engine):
+    with rt.tracing.trace_engine(engine):
         end = trace_surfaces([*surfaces, Surface(thickness=zero)], rays, indices=indices)
     assert end.valid.all()
     total = (torch.tensor(weights) * end.position[:2]).sum()

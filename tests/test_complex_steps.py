@@ -17,7 +17,7 @@ ROWS = [
     dict(radius=110.0, thickness=4.0, glass=1.62, conic=0.5, coefficients=[0.0, 2e-6]),
     dict(radius=-41.0, thickness=75.0),
 ]
-FIELDS, PUPIL = np.array([[0.0, 1.5, -2.0], [0.0, 4.0, -6.0]]), rt.gauss_rings(3)[0]
+FIELDS, PUPIL = np.array([[0.0, 1.5, -2.0], [0.0, 4.0, -6.0]]), rt.maths.gauss_rings(3)[0]
 
 
 def lens_of(rows=ROWS, **changes) -> rt.Lens:
@@ -43,7 +43,7 @@ def f_number(tracer: Tracer, numbers: Numbers) -> None:
     numbers[7, "curvature"] = (omega + numbers[7, "index"] / 16) / (y * change)
 
 
-CLIPPED = with_row(1, semi_diameter=3.6, apertures=(rt.Aperture("circular", (0.0, 3.6)),))
+CLIPPED = with_row(1, semi_diameter=3.6, apertures=(rt.system.Aperture("circular", (0.0, 3.6)),))
 TILTED = with_row(3, tilt_x=1.5, tilt_y=-0.7, y=0.2)
 
 #: Lens, variables, and the solve by which others follow. Clipped rays keep their coordinates and derivatives.

@@ -71,7 +71,7 @@ def test_the_numbers_of_the_viewer_are_those_without_sharing(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["cooke_triplet", "hubble", "folded_relay", "off_axis_telescope"])
 def test_points_on_surfaces_are_those_of_the_crossings(name):
-    rt.prepare()
+    rt.tracing.prepare()
     lens = rt.read_lens(name)
     wavelength = lens.primary
     rays = launch(lens, 0.9 * fan(2, "y", dtype=torch.float64)[0], fields=None, wavelengths=wavelength[None])

@@ -35,7 +35,7 @@ def test_every_command_takes_a_cone_beyond_a_right_angle(cone, tmp_path, command
 
 @pytest.mark.parametrize("cone", [90.0, 180.0, 200.0])
 def test_a_cone_whose_rim_lies_in_the_plane_of_the_object_is_refused(cone):
-    with pytest.raises(ValueError, match=rf"object_cone_angle {cone:g} degrees: expected less than 180, and not 90"):
+    with pytest.raises(ValueError, match=rf"object_cone_angle {cone:g} .*less than 180, and not 90"):
         rt.spot(ellipse(cone).at(fields=[0.0]))
 
 
@@ -47,5 +47,5 @@ def test_a_lens_at_other_conditions_keeps_its_cone():
 def test_the_traced_part_of_a_cone_beyond_a_right_angle_is_reported(tmp_path):
     path = tmp_path / "ellipse.zmx"
     write_lens(ellipse(160.0), path)
-    with pytest.warns(UserWarning, match=r"ellipse\.zmx:\d+: a cone of .* within 20 degrees of the axis"):
+    with pytest.warns(UserWarning, match=r"ellipse\.zmx:\d+: .*20 degrees"):
         rt.read_lens(path)

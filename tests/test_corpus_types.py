@@ -17,10 +17,10 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-import test_corpus
 import torch
+from corpus_comparison import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison, numbers, table
+from problems import SHARED
 from problems import number as real
-from test_corpus import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison
 from zemax_by_definition import surfaces, trace
 
 from raytrace.io import UnsupportedSurface, read_lens
@@ -33,9 +33,8 @@ from raytrace.system.rays import start
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import axial_path, steps
 
-CORPUS = Path(__file__).parents[2] / "shared" / "tier2"
+CORPUS = SHARED / "tier2"
 FILES = json.loads((CORPUS / "oracle_dev.json").read_text())["files"] if (CORPUS / "oracle_dev.json").exists() else {}
-needs_corpus = pytest.mark.skipif(not FILES, reason=f"no {CORPUS}: the corpus is not part of a clone")
 
 INDEX_TOLERANCE = 1e-6
 FIRST_ORDER_TOLERANCE = 1e-8  # relative: a few hundred roundings of two programs in float64
@@ -216,14 +215,14 @@ def reproduced(name: str) -> tuple[int, int, float]:
     return best
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", FILES)
 def test_file_is_right(name):
     result = compare(name)
     assert result.outcome == RIGHT, result.details
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", [name for name in FILES if FILES[name]["stored_semidiameters"]["matched"]])
 @pytest.mark.filterwarnings("ignore")
 def test_stored_semi_diameters_are_reproduced(name):
@@ -233,7 +232,7 @@ def test_stored_semi_diameters_are_reproduced(name):
     assert matched == expected["matched"] == total
 
 
-@needs_corpus
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize("name", FILES)
 def test_the_definitions_of_the_tests_are_those_of_the_oracle(name):
     """The tracer by definition, against which surfaces of every type are held, where it knows all media."""
@@ -311,7 +310,7 @@ def by_file() -> list[dict[str, str]]:
         details = details if result.outcome == RIGHT else result.details
         types_here = ", ".join(types_of(name))
         here = {"corpus": "surface types", "file": name, "types": types_here}
-        rows.append(here | test_corpus.numbers(result) | {"details": details})
+        rows.append(here | numbers(result) | {"details": details})
     return rows
 
 
@@ -332,7 +331,7 @@ def document(rows: list[dict[str, str]]) -> str:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    every, folder = by_file() + test_corpus.table(), Path(sys.argv[1])
+    every, folder = by_file() + table(), Path(sys.argv[1])
     (folder / "corpus.md").write_text(document(every), encoding="utf-8")
     with (folder / "corpus.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, every[0], lineterminator="\n")

@@ -23,7 +23,7 @@ def triplet():
 
 def sampling_of(lens):
     points = torch.stack([lens.fields.x, lens.fields.y])
-    return Sampling(points, torch.full_like(points[0], 1 / points.shape[1]), *rt.gauss_rings(4, 6))
+    return Sampling(points, torch.full_like(points[0], 1 / points.shape[1]), *rt.maths.gauss_rings(4, 6))
 
 
 def check_gradient(lens, word, **options):
@@ -33,9 +33,9 @@ def check_gradient(lens, word, **options):
     criterion = criterion_of(word, lens, sampling, **options)
 
     def quantity(errors):
-        return criterion.quantity(aligned(rt.perturbed(lens, rows, errors), 3), sampling)
+        return criterion.quantity(aligned(rt.tolerancing.perturbed(lens, rows, errors), 3), sampling)
 
-    errors = rt.draw_errors(rows, 2, seed=3).requires_grad_()
+    errors = rt.tolerancing.draw_errors(rows, 2, seed=3).requires_grad_()
     (slopes,) = torch.autograd.grad(quantity(errors).sum(), errors)
     step = 1e-3 * rows.maximum
     for k in range(2):
@@ -56,12 +56,14 @@ def mtf_of(lens, frequency):
 @pytest.mark.parametrize("frequency", [10.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_mtf_is_that_of_single_lenses(triplet, frequency):
     rows = rt.tolerances(triplet, LIMITS, compensators=[])
-    errors = rt.draw_errors(rows, 3)
+    errors = rt.tolerancing.draw_errors(rows, 3)
     sampling = sampling_of(triplet)
     criterion = criterion_of(f"mtf@{frequency:g}", triplet, sampling)
-    values = criterion.value(criterion.quantity(aligned(rt.perturbed(triplet, rows, errors), 3), sampling))
+    values = criterion.value(criterion.quantity(aligned(rt.tolerancing.perturbed(triplet, rows, errors), 3), sampling))
     for k in range(3):
-        assert float(values[k]) == pytest.approx(mtf_of(rt.perturbed(triplet, rows, errors[k]), frequency), abs=5e-4)
+        assert float(values[k]) == pytest.approx(
+            mtf_of(rt.tolerancing.perturbed(triplet, rows, errors[k]), frequency), abs=5e-4
+        )
 
 
 def test_mtf_has_exact_derivatives(triplet):
@@ -76,7 +78,7 @@ def test_changes_of_the_mtf_are_those_of_single_lenses(triplet):
             errors = torch.zeros(1, len(rows), dtype=torch.float64)
             errors[0, n] = limit
             alone = rt.tolerance(
-                rt.perturbed(triplet, rows, errors[0]), rows, criterion="mtf@30", trials=0, fields=[0, 5]
+                rt.tolerancing.perturbed(triplet, rows, errors[0]), rows, criterion="mtf@30", trials=0, fields=[0, 5]
             )
             assert float(found.nominal + change) == pytest.approx(float(alone.nominal), abs=1e-5)
 
@@ -105,7 +107,7 @@ def test_mtf_as_built_reads_the_right_way_round(triplet):
 def test_compensated_mtf_is_the_best_over_the_sensor_distance(triplet):
     rows = rt.tolerances(triplet, "thickness:3=0.05")
     found = rt.tolerance(triplet, rows, criterion="mtf@30", trials=0, fields=[0, 5])
-    lens = rt.perturbed(triplet, rows, rows.maximum)
+    lens = rt.tolerancing.perturbed(triplet, rows, rows.maximum)
     sampling = sampling_of(lens)
     criterion = criterion_of("mtf@30", triplet, sampling)
     shifts = torch.linspace(-0.2, 0.2, 201, dtype=torch.float64)
@@ -132,7 +134,7 @@ def test_criteria_that_there_are_not(triplet, word, message):
 
 
 def test_mtf_of_a_clipped_beam_is_refused(triplet):
-    clipped = triplet.replace(4, apertures=(rt.Aperture("circular", (0.0, 3.0)),))
+    clipped = triplet.replace(4, apertures=(rt.system.Aperture("circular", (0.0, 3.0)),))
     with pytest.raises(ValueError, match=r"rays of field .* are clipped or fail"):
         rt.tolerance(clipped, limits=LIMITS, criterion="mtf@20", trials=0)
 
@@ -143,16 +145,16 @@ def test_mtf_of_a_clipped_beam_is_refused(triplet):
 @pytest.mark.parametrize("kind", ["spot", pytest.param("wavefront", marks=pytest.mark.slow)])
 def test_merit_is_that_of_single_lenses(triplet, kind):
     rows, sampling = rt.tolerances(triplet, LIMITS + " irregularity=0.5 index=0.0005"), sampling_of(triplet)
-    errors = rt.draw_errors(rows, 2)
+    errors = rt.tolerancing.draw_errors(rows, 2)
     criterion = criterion_of("merit", triplet, sampling, merit=kind)
-    values = criterion.value(criterion.quantity(aligned(rt.perturbed(triplet, rows, errors), 3), sampling))
+    values = criterion.value(criterion.quantity(aligned(rt.tolerancing.perturbed(triplet, rows, errors), 3), sampling))
     for k in range(2):
-        alone = rt.evaluate(rt.perturbed(triplet, rows, errors[k]), merit=kind)
+        alone = rt.evaluate(rt.tolerancing.perturbed(triplet, rows, errors[k]), merit=kind)
         assert float(values[k]) == pytest.approx(float(alone.merit), rel=1e-9)
 
 
 def test_merit_has_exact_derivatives(triplet):
-    merit = rt.Merit.default(triplet, "spot") + rt.Merit((rt.Row("EFFL", (0, 2), target=100.0, weight=0.1),))
+    merit = rt.Merit.default(triplet, "spot") + rt.Merit((rt.system.Row("EFFL", (0, 2), target=100.0, weight=0.1),))
     check_gradient(triplet, "merit", merit=merit)
 
 
@@ -189,13 +191,13 @@ def test_merit_as_built(triplet):
 @pytest.mark.parametrize("model", ["gaussian", "drt"])
 def test_change_of_the_psf_is_that_of_single_lenses(triplet, model):
     rows, sampling = rt.tolerances(triplet, LIMITS), sampling_of(triplet)
-    errors = rt.draw_errors(rows, 2)
+    errors = rt.tolerancing.draw_errors(rows, 2)
     criterion = criterion_of("psf", triplet, sampling, model=model, pixel=0.004, size=33)
-    values = criterion.value(criterion.quantity(aligned(rt.perturbed(triplet, rows, errors), 3), sampling))
-    numbers = {"gaussian": rt.Gaussian, "drt": rt.DRT}[model](order=criterion.settings[1])
+    values = criterion.value(criterion.quantity(aligned(rt.tolerancing.perturbed(triplet, rows, errors), 3), sampling))
+    numbers = {"gaussian": rt.psf_models.Gaussian, "drt": rt.psf_models.DRT}[model](order=criterion.settings[1])
     h0 = rt.psf(triplet, numbers, pixel=0.004, size=33).kernel
     for k in range(2):
-        h = rt.psf(rt.perturbed(triplet, rows, errors[k]), numbers, pixel=0.004, size=33).kernel
+        h = rt.psf(rt.tolerancing.perturbed(triplet, rows, errors[k]), numbers, pixel=0.004, size=33).kernel
         change = ((h - h0).square().sum((-2, -1)) / h0.square().sum((-2, -1))).mean().sqrt()
         assert float(values[k]) == pytest.approx(float(change), rel=1e-9 if model == "gaussian" else 5e-3)
 
@@ -227,7 +229,11 @@ def test_boresight_is_that_of_the_chief_ray(triplet):
     for n in (int(found.worst[0]), int(found.worst[-1])):
         errors = torch.zeros(len(found.tolerances), dtype=torch.float64)
         errors[n] = found.tolerances.maximum[n]
-        chief = rt.trace(rt.perturbed(triplet, found.tolerances, errors), fields=0.0).position[:2].flatten(1)[:, 0]
+        chief = (
+            rt.trace(rt.tolerancing.perturbed(triplet, found.tolerances, errors), fields=0.0)
+            .position[:2]
+            .flatten(1)[:, 0]
+        )
         assert 1e3 * float(torch.linalg.vector_norm(chief)) == pytest.approx(float(found.maximum[n]), abs=1e-9)
     spread = float(found.trials.std()) / len(found.trials) ** 0.5
     assert abs(float(found.expected - found.trials.mean())) < 4 * spread
@@ -242,7 +248,7 @@ def test_boresight_has_exact_derivatives(triplet):
 
 
 def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
-    whole = rt.Tolerances((rt.Tolerance("element_decenter_y", (1, 7), -0.03, 0.03),))
+    whole = rt.tolerancing.Tolerances((rt.system.Tolerance("element_decenter_y", (1, 7), -0.03, 0.03),))
     found = rt.tolerance(triplet, whole, criterion="boresight", trials=0)
     assert float(found.maximum[0]) == pytest.approx(30.0, abs=0.1)
     assert float(found.slope[0]) == pytest.approx(float(found.maximum[0]), rel=1e-5)
@@ -254,7 +260,7 @@ def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
 @pytest.mark.parametrize("criterion", ["rms", "wavefront", "boresight"])
 def test_surfaces_that_cross_are_traced_as_they_stand(triplet, criterion):
     """A gap of 2 mm with an error of -3 mm: rays go back by 1 mm, as in OpticStudio."""
-    rows = rt.Tolerances((rt.Tolerance("thickness", (4,), -3.0, 3.0, adjust=6),))
+    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (4,), -3.0, 3.0, adjust=6),))
     found = rt.tolerance(triplet, rows, criterion=criterion, trials=0)
     crossed = triplet.replace(4, thickness=-1.0).replace(6, thickness=float(triplet.surfaces[6].thickness) + 3.0)
     alone = rt.tolerance(crossed, rows, criterion=criterion, trials=0)
@@ -262,6 +268,6 @@ def test_surfaces_that_cross_are_traced_as_they_stand(triplet, criterion):
 
 
 def test_compensator_that_moves_nothing_is_refused(triplet):
-    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(5, "tilt_z")])
-    with pytest.raises(rt.BadTolerance, match="it has no effect on the RMS spot radius; leave it out"):
+    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.system.Compensator(5, "tilt_z")])
+    with pytest.raises(rt.BadTolerance, match=r"no effect .*; leave it out"):
         rt.tolerance(triplet, rows, trials=0)

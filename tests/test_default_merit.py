@@ -2,15 +2,15 @@
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import SHARED
 
 import raytrace as rt
 from raytrace.optimization.merit import BadMerit, DefaultMerit
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+DEVELOPMENT = SHARED / "merit" / "dev"
 PRINTED = 1e-6  # the files hold six to twelve digits
 
 SQUARE = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]
@@ -53,11 +53,10 @@ def stored(path):
     return rows[0][0], np.array([[float(number) for number in row[2:9]] for row in rows]), rule
 
 
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize("name", STORED)
 def test_a_stored_default_merit_function_is_made_again_row_by_row(name):
     path = DEVELOPMENT / name
-    if not path.exists():
-        pytest.skip("the development files are not here")
     operand, expected, rule = stored(path)
     options = {**rule, **STORED[name]}
     kind, reference = KINDS[operand]
@@ -168,10 +167,9 @@ def test_impossible_merit_functions_are_refused(kind, options, said):
         DefaultMerit(kind, **options).rows(rt.read_lens("double_gauss"))
 
 
+@pytest.mark.needs(DEVELOPMENT)
 def test_the_list_of_stored_merit_functions_is_that_of_the_oracle():
     path = DEVELOPMENT / "oracle.json"
-    if not path.exists():
-        pytest.skip("the development files are not here")
     files = {one["file"] for one in json.loads(path.read_text())["files"] if one["copied"]}
     edited = {"Project_X__Schmidt-Cassegrain.zmx", "Project_X__sc_scan2.ZMX"}  # by hand, after they were made
     assert files == {*STORED, *edited}

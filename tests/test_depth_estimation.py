@@ -2,16 +2,14 @@
 
 import pytest
 import torch
+from scripts import script
 
-from raytrace.imaging.depth_estimation import (
-    blurred_spectra,
-    cramer_rao,
-    expected_log_likelihood_ratios,
-    expected_square_error,
-    log_likelihoods,
-    most_likely,
-)
 from raytrace.imaging.restoration import power_law
+
+depth = script("depth_estimation")
+blurred_spectra, cramer_rao, log_likelihoods = depth.blurred_spectra, depth.cramer_rao, depth.log_likelihoods
+expected_log_likelihood_ratios, most_likely = depth.expected_log_likelihood_ratios, depth.most_likely
+expected_square_error = depth.expected_square_error
 
 SIZE, NOISE = 32, 0.1
 PLACES = torch.linspace(0, 1, 11, dtype=torch.float64)

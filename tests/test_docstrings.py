@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 import torch
-from test_layers import FLOORS, MODULES, PACKAGE, package_of, parsed
+from layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 import raytrace
 
@@ -92,9 +92,7 @@ def is_there(dotted: str, name: str) -> bool:
 
 
 def test_dotted_names_in_docstrings_are_there():
-    """In all modules but those that need the extra [bench]."""
-    names = [name for name in MODULES if not name.startswith("bench.peers")]
-    assert [(name, dotted) for name in names for dotted in sorted(named(name)) if not is_there(dotted, name)] == []
+    assert [(name, dotted) for name in MODULES for dotted in sorted(named(name)) if not is_there(dotted, name)] == []
 
 
 def test_a_name_of_the_past_is_not_there():
@@ -127,8 +125,8 @@ def given() -> dict:
         "rt": raytrace,
         "torch": torch,
         "lens": raytrace.read_lens("cooke_triplet"),
-        "element": raytrace.elements("ideal", aperture=1.0)[0],
-        "network": raytrace.UNet(channels=3),
+        "element": raytrace.wave_optics.phase_elements("ideal", aperture=1.0)[0],
+        "network": raytrace.imaging.UNet(channels=3),
         "picture": torch.rand(3, 160, 240),
         "pictures": torch.rand(1, 3, 128, 128),
         "index": [0],

@@ -1,8 +1,6 @@
 """Documentation: quoted commands parse, and columns and labels use the terms of the field."""
 
 import argparse
-import contextlib
-import io
 import re
 import shlex
 from pathlib import Path
@@ -14,8 +12,6 @@ from raytrace.cli import build_parser
 from raytrace.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
-#: What only those who made the package would understand.
-PRIVATE = re.compile(r"\b(the talk|one equation|the original's|blind (one|filter)|in the loop|waves added)\b", re.I)
 
 
 def commands(page: str) -> list[str]:
@@ -25,21 +21,6 @@ def commands(page: str) -> list[str]:
 
 
 PAGES = sorted(path for path in (*ROOT.glob("docs/*.md"), ROOT / "README.md") if commands(path.read_text("utf-8")))
-
-
-#: Lines of pages or sections whose code has been removed.
-FROZEN = [
-    (path.name, line)
-    for path in sorted(ROOT.glob("docs/*.md"))
-    for line in re.findall(r"^Frozen: .*$", path.read_text("utf-8"), re.MULTILINE)
-]
-
-
-def test_frozen_sections_name_their_commit():
-    assert len(FROZEN) > 10
-    for page, line in FROZEN:
-        assert re.match(r"Frozen: made .*\b09fbd61\b.*`raytrace .+`|Frozen: made by `raytrace ", line), page
-        assert "The command is not part of the package any more" in line, page
 
 
 @pytest.mark.parametrize("page", sorted(ROOT.glob("docs/**/*.md")), ids=lambda path: str(path.relative_to(ROOT)))
@@ -69,23 +50,6 @@ def test_quoted_commands_are_understood(page):
         assert build_parser().parse_args(words[1:]).command == words[1], line
 
 
-def test_pages_that_quote_commands_are_many():
-    assert len(PAGES) > 10
-
-
-@pytest.mark.parametrize("words", [(c.name,) for c in COMMANDS] + [("wave", s) for s in ("psf", "design", "restore")])
-def test_help_has_no_private_words(words):
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
-        build_parser().parse_args([*words, "--help"])
-    assert not PRIVATE.search(" ".join(out.getvalue().split()))
-
-
-@pytest.mark.parametrize("page", [path for path in PAGES if path.stem.startswith("wave")], ids=lambda path: path.name)
-def test_pages_have_no_private_words(page):
-    assert not PRIVATE.search(" ".join(page.read_text("utf-8").split()))
-
-
 def test_the_error_axis_of_learning_has_numbers():
     focusing = script("focusing")
     figure = focusing.learn_to_focus(focusing.Setting(samples=16), steps=2, frames=(0, 2)).plot()
@@ -101,5 +65,7 @@ def test_the_caption_of_a_single_kernel_stays_on_its_page():
 
     import raytrace
 
-    found = raytrace.wave_psf("singlet", depths=[500], wavelengths=[0.46], size=8, engine="pupil", samples=600)
+    found = raytrace.wave_optics.wave_psf(
+        "singlet", depths=[500], wavelengths=[0.46], size=8, engine="pupil", samples=600
+    )
     assert not outside(found.plot())

@@ -106,7 +106,7 @@ def psf(model):
 
 
 def energy(glass, fields):
-    return rt.psf(glass, rt.Gaussian(order=3), fields=fields, pixel=0.03, size=61).energy[0]
+    return rt.psf(glass, rt.psf_models.Gaussian(order=3), fields=fields, pixel=0.03, size=61).energy[0]
 
 
 def illumination(glass, fields):
@@ -117,9 +117,9 @@ def illumination(glass, fields):
 QUANTITIES = {
     "spot": (spot, slice(1, 3), 2e-6),
     "energy": (energy, slice(0, 1), 2e-6),
-    "gaussian": (psf(rt.Gaussian(order=4)), slice(1, 3), 2e-5),
-    "drt": (psf(rt.DRT(order=4)), slice(1, 3), 1e-2),
-    "wave": (psf(rt.Wave(order=0)), slice(1, 3), 2e-6),
+    "gaussian": (psf(rt.psf_models.Gaussian(order=4)), slice(1, 3), 2e-5),
+    "drt": (psf(rt.psf_models.DRT(order=4)), slice(1, 3), 1e-2),
+    "wave": (psf(rt.psf_models.Wave(order=0)), slice(1, 3), 2e-6),
 }
 
 
@@ -224,7 +224,7 @@ def test_a_merit_function_of_a_clipped_spot_has_the_derivatives_of_the_light():
         return rt.spot(glass, fields=[10.0]).rms_radius[0, 0]
 
     model = DesignVariables(glass, (Vary(0, "aperture"), Vary(5, "thickness"), Vary(6, "thickness")))
-    evaluation = Evaluation(model, [rt.Row(rt.Measure("size", size), weight=1.0)])
+    evaluation = Evaluation(model, [rt.system.Row(rt.optimization.Measure("size", size), weight=1.0)])
     found = evaluation(model.start, derivatives=True)
     expected = slopes_by_differences(evaluation, model.start, 1e-4)
     np.testing.assert_allclose(found.jacobian, expected, rtol=1e-6)

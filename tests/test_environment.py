@@ -167,7 +167,7 @@ def doublet_at_100_degrees():
 
 def image_radius(lens):
     rim = torch.tensor([[0.0, 0.0], [1.0, -1.0]], dtype=torch.float64)
-    return rt.trace(lens, rt.rays(lens, pupil=rim)).position[:2].norm(dim=0).max().item()
+    return rt.trace(lens, rt.tracing.rays(lens, pupil=rim)).position[:2].norm(dim=0).max().item()
 
 
 def test_doublet_meets_the_radius_that_opticstudio_stored_at_100_degrees():
@@ -194,7 +194,7 @@ def test_vacuum_in_a_cell_is_thinner_than_the_air_around_it():
     assert media(lens, lens.wavelengths)[3].item() == pytest.approx(1 / 1.00027308, abs=1e-8)
     assert first_order(lens).paraxial_image_distance.item() == pytest.approx(63.25768502176, abs=1e-11)
     rim = torch.tensor([[0.0, 0.0], [1.0, -1.0]], dtype=torch.float64)
-    height = rt.trace(lens, rt.rays(lens, pupil=rim)).position[1].abs().max().item()
+    height = rt.trace(lens, rt.tracing.rays(lens, pupil=rim)).position[1].abs().max().item()
     assert height == pytest.approx(21.2820365547, abs=4e-8)
     in_vacuum = lens.at(pressure=0.0)  # all of it: the windows are as they were, the gaps as their surroundings
     assert media(in_vacuum, lens.wavelengths)[3].item() == 1.0
@@ -238,16 +238,16 @@ def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
 
     def spread(celsius, pressure):
         found = lens.at(temperature=celsius, pressure=pressure)
-        rays = rt.rays(found, fields=[0, 10], pupil=rt.gauss_rings(4))
+        rays = rt.tracing.rays(found, fields=[0, 10], pupil=rt.maths.gauss_rings(4))
         traced = trace_lens(found, rays, found.wavelengths[:, None])
-        return spot_of(traced, rt.gauss_rings(4)[1]).mean_square_radius
+        return spot_of(traced, rt.maths.gauss_rings(4)[1]).mean_square_radius
 
-    with rt.trace_engine(engine):
+    with rt.tracing.trace_engine(engine):
         given = (float64(35.0, requires_grad=True), float64(0.6, requires_grad=True))
         # 1e-6 a degree: steps of a hundredth of a degree and of an atmosphere are far above rounding.
         assert gradcheck(spread, given, eps=1e-2, atol=1e-9, rtol=1e-4)
         found = torch.autograd.grad(spread(*given).sum(), given)
-    with rt.trace_engine("eager"):
+    with rt.tracing.trace_engine("eager"):
         expected = torch.autograd.grad(spread(*given).sum(), given)
     assert torch.allclose(torch.stack(found), torch.stack(expected), rtol=1e-9)
 
@@ -500,7 +500,7 @@ def test_a_file_brings_environments_back_bit_for_bit(tmp_path, conditions):
 
 
 def test_a_surface_in_an_environment_of_a_lens_without_one_is_not_written(tmp_path):
-    with pytest.raises(rt.LensFileError, match="surface 3: a surface in an environment of its own, of a lens without"):
+    with pytest.raises(rt.LensFileError, match=r"surface 3: .*environment of its own"):
         rt.write_lens(vacuum_cell(), tmp_path / "cell.zmx")
     assert not [*tmp_path.iterdir()]
 
@@ -529,9 +529,9 @@ def test_configurations_have_their_temperatures_and_pressures(tmp_path):
 def test_temperatures_at_which_no_glass_is_one_are_refused_and_extrapolated_ones_reported():
     """The polynomials of third order in T make a focal length of 10⁻²³ mm at 10⁶ °C."""
     lens = rt.read_lens("cooke_triplet")
-    with pytest.raises(ValueError, match=r"temperature=1e\+06.*up to 1000; thermal coefficients .* from -100 to 140"):
+    with pytest.raises(ValueError, match=r"temperature=1e\+06.*up to 1000; .* -100 to 140"):
         lens.at(temperature=1e6)
-    with pytest.warns(NoThermalCoefficients, match="extrapolated to 200 °C; those of catalogs hold from -100 to 140"):
+    with pytest.warns(NoThermalCoefficients, match=r"200 °C; .* -100 to 140"):
         lens.at(temperature=200)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -36,21 +36,21 @@ def test_noise_is_that_of_electrons():
 
 def test_the_expected_error_is_that_of_restored_pictures():
     """Of periodic pictures with the spectrum of the filter, blurred by two kernels, with constant noise."""
-    spectrum, generator = rt.power_law(32), torch.Generator().manual_seed(0)
+    spectrum, generator = rt.imaging.power_law(32), torch.Generator().manual_seed(0)
     kernels = torch.zeros(1, 2, 5, 5, dtype=torch.float64)
     kernels[0, 0, 2, 2] = 1
     kernels[0, 1] = 1 / 25
     sigma = torch.tensor([0.05], dtype=torch.float64)
     expected = float(aperture.error_of(kernels, spectrum, sigma)[0])
     transfer = aperture.transfer_functions(kernels[0], 32)
-    filter = rt.depth_invariant_wiener(transfer, spectrum, sigma[0])
+    filter = rt.imaging.depth_invariant_wiener(transfer, spectrum, sigma[0])
     white = torch.randn(400, 32, 32, dtype=torch.float64, generator=generator)
     pictures = torch.fft.ifft2(torch.fft.fft2(white) * spectrum.sqrt()).real
     found = []
     for one in transfer:
         image = torch.fft.ifft2(torch.fft.fft2(pictures) * one).real
         image = aperture.add_noise(image, float(sigma[0]), generator=generator)
-        found.append(float((rt.restore(image, filter) - pictures).square().mean()))
+        found.append(float((rt.imaging.restore(image, filter) - pictures).square().mean()))
     assert sum(found) / 2 == pytest.approx(expected, rel=0.03)
 
 

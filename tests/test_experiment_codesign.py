@@ -27,7 +27,6 @@ from raytrace.imaging.codesign import (
 )
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.io import read_lens
-from raytrace.pages import kept_of, markdown
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 from raytrace.tracing.focus import best_focus
@@ -35,6 +34,7 @@ from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 page_script, study, judged = script("codesign"), script("codesign_study"), script("codesign_claims")
 focus_marks = script("codesign_figures").focus_marks
+kept_of, markdown = script("pages").kept_of, script("pages").markdown
 CAPTIONS, Report = page_script.CAPTIONS, page_script.Report
 CLAIMS, Seen, claims, is_of_paper = judged.CLAIMS, judged.Measurements, judged.claims, judged.is_of_paper
 AFTER_PARAXIAL, COLUMNS, StepTime = study.AFTER_PARAXIAL, study.COLUMNS, study.StepTime

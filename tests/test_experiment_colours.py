@@ -15,7 +15,7 @@ def test_synthetic_spectra_have_their_correlation_in_every_band():
     pictures = dead_leaves(8, size=64, colour=True, correlation=0.8)
     patches = colours.patches(pictures, 64, 2)
     assert patches.shape == (16, 3, 64, 64)
-    measured = rt.cross_spectrum(patches)
+    measured = rt.imaging.cross_spectrum(patches)
     of_synthetic = colours.synthetic(measured, 0.97)
     assert np.allclose(colours.correlations(of_synthetic), 0.97, rtol=1e-12)
     mean = measured.real.mean((-2, -1)).diagonal().mean()
@@ -51,7 +51,7 @@ def test_the_second_start_has_axial_colour_and_the_focal_length(name):
 @pytest.mark.slow
 def test_descents_of_both_filters_have_equal_budgets():
     """A few evaluations, on the axis and at one distance, behind filters apart and joint: the error falls in both."""
-    spectrum = colours.synthetic(rt.power_law(colours._PERIOD).expand(3, 3, -1, -1), 0.97)
+    spectrum = colours.synthetic(rt.imaging.power_law(colours._PERIOD).expand(3, 3, -1, -1), 0.97)
     ends = []
     for filters in ("apart", "joint"):
         end = colours.optimised(

@@ -85,7 +85,7 @@ def test_the_same_seed_is_the_same_course():
 
 
 def test_an_even_window_is_refused():
-    with pytest.raises(ValueError, match="no pixel at its middle: expected an odd size"):
+    with pytest.raises(ValueError, match="expected an odd size"):
         learn_to_focus(Setting(size=64))
 
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch
-from test_zemax import file, read
+from problems_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main
@@ -139,26 +139,26 @@ def test_a_substitute_is_taken_where_it_is_asked_for_and_reported(suffix, tmp_pa
         read_lens(path)
     wanted = find_glass("N-BK7").coefficients
     for asked in ({"XK99": "N-BK7"}, "xk99=N-BK7", ["XK99=N-BK7"]):
-        with pytest.warns(LensFileWarning, match=r"N-BK7 \(SCHOTT\) is taken for the glass XK99, as requested"):
+        with pytest.warns(LensFileWarning, match=r"N-BK7 \(SCHOTT\) .* XK99, as requested"):
             lens = read_lens(path, substitute=asked)
         assert any(surface.glass.coefficients.equal(wanted) for surface in lens.surfaces)
     assert "N-BK7 (SCHOTT) is taken" in str(rt.check(path, substitute="XK99=N-BK7"))
     if suffix in (".zmx", ".csv"):
         for asked in ("nearest", "XK99=nearest", {"XK99": "nearest"}):
-            with pytest.warns(LensFileWarning, match=r"\(\w+\) is taken for the unknown glass XK99: the nearest to nd"):
+            with pytest.warns(LensFileWarning, match=r"\(\w+\) .*unknown glass XK99: the nearest"):
                 lens = read_lens(path, substitute=asked)
             glass = next(one.glass for one in lens.surfaces if one.glass.name)
             assert abs(glass.nd_listed - 1.5168) < 1e-5
             assert abs(glass.abbe_listed - 64.17) < 0.01
     else:
-        with pytest.raises(UnknownGlass, match="the file has no nd and Vd to find the nearest glass by"):
+        with pytest.raises(UnknownGlass, match="no nd and Vd"):
             read_lens(path, substitute="nearest")
 
 
 def test_substitutes_that_mean_nothing_are_refused_or_reported(tmp_path):
     path = tmp_path / "lens.zmx"
     path.write_text(file())
-    with pytest.warns(LensFileWarning, match="a substitute for the glass SF5 was requested, which is not in the file"):
+    with pytest.warns(LensFileWarning, match=r"substitute .*SF5 .*not in the file"):
         read_lens(path, substitute="SF5=F2")
     for wrong in ("SF5", "=F2", {"SF5": ""}, {"SF5": 3}):
         with pytest.raises(BadSubstitute, match="expected GLASS=OTHER, nearest or formula"):
@@ -215,7 +215,7 @@ def test_indices_beyond_the_lines_of_a_glass_by_its_code_are_refused_unless_aske
     """At 404.7 nm the formula errs by more than 1e-4, which is reported with remedies; not between F and C."""
     _, report = sequence("656.27 587.56 546.1 486.13", name)
     assert not report.warnings
-    with pytest.raises(LensFileError, match=rf"index of {name} at 404\.7 nm is est.*to about \d\.\de-03.*=formula"):
+    with pytest.raises(LensFileError, match=rf"{name} at 404\.7 nm .*\d\.\de-03.*=formula"):
         sequence("587.56 404.7", name)
     lens, report = sequence("587.56 404.7", name, substitutes=substitutes_of(f"{name}=formula"))
     assert "to about" in report.warnings[0]
@@ -253,7 +253,7 @@ def test_a_table_is_met_at_the_lines_of_the_lens_and_estimated_between_them():
     assert float(re.search(r"indices, met to (\S+)", report.notes[0])[1]) < 3e-4  # 6.6e-4 through six of them
     found = index(lens.surfaces[1].glass, torch.tensor([0.5876, 0.4861, 0.65], dtype=torch.float64))
     assert (found - torch.tensor([1.5312, 1.5378, 1.5286], dtype=torch.float64)).abs().max() < 1e-13
-    with pytest.raises(LensFileError, match=r"index of E48 at 633 nm is estimated by a formula, to about 2\.\de-04"):
+    with pytest.raises(LensFileError, match=r"E48 at 633 nm .*formula, .*2\.\de-04"):
         sequence("587.6 633", "'E48'", table)
     assert sequence("587.6 633", "'E48'", table, substitutes=substitutes_of("E48=formula"))[1].warnings
     three = "PWL 656.27 587.56 486.13\n'X' 1.6158 1.62 1.6321"
@@ -301,7 +301,7 @@ def test_a_written_glass_has_its_nd_and_vd_for_a_substitute(tmp_path):
     (line,) = re.findall("GLAS .*", path.read_text())
     assert line.split()[4:6] == [repr(glass.nd_listed), repr(glass.abbe_listed)]
     path.write_text(path.read_text().replace("N-SF6", "XK99"))
-    with pytest.warns(LensFileWarning, match="taken for the unknown glass XK99: the nearest to nd 1.80518, Vd 25.36"):
+    with pytest.warns(LensFileWarning, match="XK99: the nearest to nd 1.80518, Vd 25.36"):
         nearest = read_lens(path, substitute="nearest").surfaces[1].glass
     assert abs(nearest.nd_listed - glass.nd_listed) < 1e-5
     assert abs(nearest.abbe_listed - glass.abbe_listed) < 0.02

@@ -43,7 +43,7 @@ def test_a_refusal_names_the_surface_and_the_alternatives(run, tmp_path, argv, s
 
 
 def test_kinds_in_words():
-    assert named(rt.IdealLens(0.1, 0.1)) == "an ideal lens"
+    assert named(rt.system.IdealLens(0.1, 0.1)) == "an ideal lens"
     assert with_article("biconic") == "a biconic"
 
 
@@ -79,22 +79,22 @@ def test_a_parallel_beam_has_encircled_energy(tmp_path):
 
 def test_models_are_compared_where_a_surface_is_curved():
     ideal = rt.lens(
-        [dict(thickness=50.0, phase=rt.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
+        [dict(thickness=50.0, phase=rt.system.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
     )
-    with pytest.raises(ValueError, match="no refracting or reflecting surface of this lens is curved; ask for kernels"):
+    with pytest.raises(ValueError, match=r"no surface .* is curved; ask for kernels"):
         abilities(ideal)
 
 
 def test_an_object_at_the_first_surface_is_refused_with_the_way_out():
     lens = rt.read_lens("singlet").at(fields=[0.0])
-    with pytest.raises(ValueError, match=r"other than 0 and nan; give others by `object_distances`"):
+    with pytest.raises(ValueError, match=r"0 and nan; .*`object_distances`"):
         rt.psf(lens, "drt", object_distances=[0.0])
 
 
 def test_a_spectrum_is_no_blur_of_waves():
     """Five colours 3 mm apart: of waves alone the light would be counted over and over."""
     lens = rt.read_lens("spectrometer")
-    with pytest.raises(ValueError, match=r"from the centroid of all, .* `geometric`, or for one of the `wavelengths`"):
+    with pytest.raises(ValueError, match=r"`geometric`, .*`wavelengths`"):
         rt.encircled_energy(lens)
     assert float(rt.encircled_energy(lens, geometric=True).share.detach().max()) <= 1
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import for_examples, number, vector
+from problems import SHARED, for_examples, number, vector
+from problems_files import damaged, leaves, read_damaged, readable
 
 import raytrace as rt
 from raytrace.files import shipped
@@ -27,28 +28,8 @@ from raytrace.system.surface import Aperture, is_freeform, is_posed
 
 ROOT = Path(__file__).parents[1]
 OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORMATS)
-CORPUS = sorted(
-    path for folder in ("corpus/zmx", "tier2/dev") for path in (ROOT.parent / "shared" / folder).glob("*.[zZ][mM][xX]")
-)
+CORPUS = sorted(path for folder in ("corpus/zmx", "tier2/dev") for path in (SHARED / folder).glob("*.[zZ][mM][xX]"))
 SUFFIXES = WRITTEN
-
-
-def leaves(value, path=""):
-    """Every number and text of a lens with its name; numbers as their bytes."""
-    if isinstance(value, torch.Tensor):
-        return [(path, tuple(value.shape), value.double().numpy().tobytes())]
-    if dataclasses.is_dataclass(value):
-        return [leaf for f in dataclasses.fields(value) for leaf in leaves(getattr(value, f.name), f"{path}.{f.name}")]
-    if isinstance(value, tuple):
-        return [leaf for k, part in enumerate(value) for leaf in leaves(part, f"{path}[{k}]")]
-    return [(path, value)]
-
-
-def readable(path: Path) -> Lens | None:
-    try:
-        return read_lens_with_report(path)[0]
-    except (LensFileError, UnknownGlass):
-        return None
 
 
 # -- round trips -------------------------------------------------------------------------------------------------------
@@ -98,12 +79,12 @@ def without_intent(lens):
     return dataclasses.replace(lens, surfaces=surfaces, optimization_data=None)
 
 
-@pytest.mark.skipif(not CORPUS, reason="the corpus of real files is not at hand")
+@pytest.mark.needs(SHARED)
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
 def test_real_files_round_trip_bit_identically(path, tmp_path):
     lens = readable(path)
-    if lens is None:
-        pytest.skip("refused by name")
+    if lens is None:  # refused by name
+        return
     plain = not any(
         is_posed(surface) or is_freeform(surface) or surface.phase or surface.sag_terms for surface in lens.surfaces
     )
@@ -234,9 +215,9 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
 
 def test_an_unknown_name_lists_the_shipped_lenses():
     for name in ("double_gaus", "double_gaus.zmx"):
-        with pytest.raises(LensFileError, match=r"lenses are .*cooke_triplet.*; did you mean double_gauss\?"):
+        with pytest.raises(LensFileError, match=r"cooke_triplet.*did you mean double_gauss"):
             read_lens(name)
-    with pytest.raises(LensFileError, match="no such file or shipped lens; the shipped lenses are"):
+    with pytest.raises(LensFileError, match=r"no such file .*the shipped lenses are"):
         read_lens("biotar")
 
 
@@ -314,72 +295,6 @@ def test_long_lines_do_not_hang(line, name):
 
 
 # -- damaged files -----------------------------------------------------------------------------------------------------
-
-_NUMBERS = "nan inf -inf INFINITY 1e999 1e308 -1e308 1e-320 0 -1 1 2 24 99 12345678901234567890 1_0 ١ 1,5 -0.0 10,20"
-_NAMES = '___BLANK MIRROR AIR 517642 STANDARD EVENASPH COORDBRK SURF STOP IN M METER 1.5/ = ( ) # : nm + é \x00 " ""'
-_WORDS = [*_NUMBERS.split(" "), *_NAMES.split(" ")]
-
-
-def damaged(content: bytes, source: random.Random) -> bytes:
-    """A file with bytes, lines or words changed, lost, doubled or moved."""
-    for _ in range(source.choice([1, 1, 1, 2, 3, 8])):
-        kind = source.randrange(9)
-        position = source.randrange(len(content) + 1)
-        noise = source.randbytes(source.randrange(1, 9))
-        if kind == 0:
-            content = content[:position] + noise[:1] + content[position + 1 :]
-        elif kind == 1:
-            content = content[:position]
-        elif kind == 2:
-            content = content[:position] + noise + content[position:]
-        else:
-            content = _edited(content, kind, source)
-    return content
-
-
-def _edited(content: bytes, kind: int, source: random.Random) -> bytes:
-    encoding = "utf-16" if content[:2] == b"\xff\xfe" else "latin-1"
-    lines = content.decode(encoding, "replace").split("\n")
-    at, other = source.randrange(len(lines)), source.randrange(len(lines))
-    if kind == 3:
-        del lines[at]
-    elif kind == 4:
-        lines.insert(other, lines[at])
-    elif kind == 5:
-        lines[at], lines[other] = lines[other], lines[at]
-    else:
-        separator = source.choice([" ", ",", "\t"])
-        words = lines[at].split(separator)
-        words[source.randrange(len(words))] = source.choice(_WORDS)
-        lines[at] = separator.join([*words, source.choice(_WORDS)] if kind == 8 else words)
-    return "\n".join(lines).encode(encoding, "replace")
-
-
-def one_line(error: Exception) -> None:
-    assert "\n" not in str(error)
-
-
-def read_damaged(path: Path, content: bytes) -> None:
-    """A lens of finite numbers that can be written and read again, or one of the two errors, in one line."""
-    form = FORMATS[path.suffix.lower()]
-    try:
-        lens, report = form.read(decode(content, Place(path.name)), path.name)
-    except (LensFileError, UnknownGlass) as error:
-        return one_line(error)
-    assert str(report)
-    numbers = [
-        leaf for surface in lens.surfaces for leaf in leaves(dataclasses.replace(surface, thickness=number(0.0)))
-    ]
-    assert all(
-        torch.isfinite(torch.frombuffer(bytearray(leaf[2]), dtype=torch.float64)).all() for leaf in numbers if leaf[2:]
-    )
-    try:
-        written = form.write(lens, path.name)
-    except LensFileError as error:  # a text that no file can hold
-        return one_line(error)
-    again = form.read(decode(written, Place(path.name)), path.name)[0]
-    assert leaves(again.surfaces) == leaves(lens.surfaces)
-    return None
 
 
 _ORIGINALS = [(path, path.read_bytes()) for path in (*OWN, *CORPUS)]
@@ -464,10 +379,10 @@ FEATURES = {
         (featured(kind="toroidal", coefficients=vector(0.01)), "refused"),
         (featured(kind="biconic", coefficients=vector(0.01, 0.0)), "refused"),
     ],
-    "tilts and decentres": [(featured(before=rt.Pose(tilt_x=number(3.0))), "refused")],
+    "tilts and decentres": [(featured(before=rt.system.Pose(tilt_x=number(3.0))), "refused")],
     "gratings, holograms, phases": [
-        (featured(phase=rt.Grating(number(0.1), number(1.0))), "refused|powers"),
-        (featured(phase=rt.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
+        (featured(phase=rt.system.Grating(number(0.1), number(1.0))), "refused|powers"),
+        (featured(phase=rt.system.RadialPhase(vector(3.0, 1.0), number(2.0), number(1.0))), "refused"),
     ],
     "apertures and obscurations": [
         (featured(apertures=(Aperture("rectangular", (4.0, 3.0)),)), "refused"),

@@ -161,7 +161,7 @@ def test_training_has_the_derivatives_of_an_edge():
 def test_an_edge_that_is_asked_for_is_that_of_the_rim():
     """The edge of the result is measured on the lens, at the larger height of both faces that its light reaches."""
     triplet = rt.read_lens("cooke_triplet")
-    merit = rt.DefaultMerit("spot", edge=1.0)
+    merit = rt.optimization.DefaultMerit("spot", edge=1.0)
     found = rt.optimize(triplet, merit=merit, vary="curvature thickness:1,3,6 sensor", hold="efl=100", cycles=25)
     (edge,) = (one for one in found.conditions if one.name.startswith("MNEG"))
     sizes = semi_diameters(found.lens)

@@ -186,7 +186,7 @@ def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zer
 
 
 def test_index_warns_outside_the_range_and_names_glass_wavelength_and_range():
-    with pytest.warns(OutOfRange, match=r"N-BK7 \(SCHOTT\) is extrapolated to 10\.6 µm.* 0\.3 to 2\.5 µm"):
+    with pytest.warns(OutOfRange, match=r"N-BK7 .*10\.6 µm.* 0\.3 to 2\.5 µm"):
         n = index(BK7, float64([0.55, 10.6]))
     assert n[1].item() == pytest.approx(3.895422492943524, rel=4 * ULP)  # mpmath
 

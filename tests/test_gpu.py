@@ -49,8 +49,8 @@ ANALYSES = {
     "first_order": rt.first_order,
     "spot": rt.spot,
     "spot of many": lambda lens: rt.spot(lens, rays=100_000),
-    "rays": lambda lens: rt.rays(lens, fields=[0, 5]),
-    "base_ray": rt.base_ray,
+    "rays": lambda lens: rt.tracing.rays(lens, fields=[0, 5]),
+    "base_ray": rt.tracing.base_ray,
     "trace": lambda lens: rt.trace(lens, fields=[5]),
     "focus": lambda lens: rt.focus(lens).lens.surfaces[-2].thickness,
     "wavefront": rt.wavefront,
@@ -71,7 +71,7 @@ ANALYSES = {
     "ray_fan": rt.ray_fan,
     "relative_illumination": rt.relative_illumination,
     "rms_over_field": rt.rms_over_field,
-    "evaluate": lambda lens: rt.evaluate(lens, merit=rt.DefaultMerit()),
+    "evaluate": lambda lens: rt.evaluate(lens, merit=rt.optimization.DefaultMerit()),
     "layout": rt.layout,
 }
 
@@ -134,7 +134,7 @@ def test_derivative(of, name):
 def test_streamed_gradient(name):
     def make(lens):
         changed, leaf = with_leaf(lens)
-        return rt.mean_square_gradient(changed, [leaf], 200_000)
+        return rt.tracing.mean_square_gradient(changed, [leaf], 200_000)
 
     agree(*both(make, name), rtol=1e-8)
 
@@ -151,7 +151,7 @@ def test_float32_trace_of_a_million_rays():
 def test_optimize():
     def make(lens):
         return (
-            rt.optimize(lens, merit=rt.DefaultMerit(), vary="curvature sensor", hold="efl", cycles=5)
+            rt.optimize(lens, merit=rt.optimization.DefaultMerit(), vary="curvature sensor", hold="efl", cycles=5)
             .lens.surfaces[1]
             .curvature
         )
@@ -163,9 +163,11 @@ def test_optimize():
 @pytest.mark.parametrize("engine", ["pupil", "radial", "fresnel", "angular_spectrum"])
 def test_wave_psf(engine):
     def make(device):
-        (element,) = rt.elements("singlet", aperture=2.0)
+        (element,) = rt.wave_optics.phase_elements("singlet", aperture=2.0)
         element = rt.to(element, device=device)
-        return rt.wave_psf(element, depths=[500.0, 1000.0], wavelengths=[0.55], size=31, engine=engine).kernel
+        return rt.wave_optics.wave_psf(
+            element, depths=[500.0, 1000.0], wavelengths=[0.55], size=31, engine=engine
+        ).kernel
 
     agree(make("cpu"), make("cuda"), rtol=1e-7)
 
@@ -189,7 +191,7 @@ def test_training_step(model):
 
 def test_noise_is_seeded_on_the_device():
     picture = torch.full((1, 1, 64, 64), 0.5, dtype=torch.float64, device="cuda")
-    noisy = rt.add_noise(picture, 0.1, generator=torch.Generator(device="cuda").manual_seed(0))
-    again = rt.add_noise(picture, 0.1, generator=torch.Generator(device="cuda").manual_seed(0))
+    noisy = rt.imaging.add_noise(picture, 0.1, generator=torch.Generator(device="cuda").manual_seed(0))
+    again = rt.imaging.add_noise(picture, 0.1, generator=torch.Generator(device="cuda").manual_seed(0))
     assert torch.equal(noisy, again)
     assert abs(float(noisy.std()) - 0.1) < 0.01

@@ -15,7 +15,7 @@ import hardcases_splat
 import hardcases_wave
 import pytest
 import torch
-from hardcases_scene import CASES, OUTPUTS, Scene
+from hardcases_scene import CASES, OUTPUTS, Scene, of_kind
 
 from raytrace.materials.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
 from raytrace.tracing.wavefront import path_to_reference_sphere
@@ -29,11 +29,6 @@ LONG_CHAIN_SCORE = 100.0  # rounding accumulates over more than 20 surfaces
 GRADIENT_SCORE = 100.0
 OPD_WAVES = {torch.float64: 1e-11, torch.float32: 3e-3}
 STATUS = {"tangent": "miss", "tir_critical": "tir"}  # limits of a miss and of total reflection
-
-
-def of_kind(kind: str) -> list:
-    """Parameters of a test: the cases of a kind."""
-    return [pytest.param(case, id=f"{kind}-{case['id']}") for case in CASES if case["kind"] == kind]
 
 
 def by_engine() -> list:

@@ -55,12 +55,12 @@ def assert_no_nan(rays: Rays, *leaves: torch.Tensor) -> None:
 
 @both_engines
 @DTYPES
-@pytest.mark.parametrize("glass", [rt.AIR, MIRROR])
+@pytest.mark.parametrize("glass", [rt.materials.AIR, MIRROR])
 @pytest.mark.parametrize("off", [-64, -1, 0, 1, 64])
 def test_an_order_at_its_cut_off(engine, dtype, glass, off):
     """sin θ = order · frequency · λ: below 1 light grazes away, at 1 and above there is none, and it steers nothing."""
     frequency = torch.tensor(2.0 + 4 * off * torch.finfo(dtype).eps, dtype=dtype).requires_grad_()
-    grating = surface(None, 0.0, glass, phase=rt.Grating(frequency, torch.ones((), dtype=dtype)))
+    grating = surface(None, 0.0, glass, phase=rt.system.Grating(frequency, torch.ones((), dtype=dtype)))
     end = trace([grating], beam([0.0, 1.0]), dtype=dtype)
     assert end.valid.tolist() == [off < 0] * 2
     assert_no_nan(end, frequency)
@@ -87,8 +87,8 @@ def test_failed_rays_have_no_gradient(engine):
         leaves = [leaf.requires_grad_() for leaf in (tilt, frequency, terms)]
         surfaces = [
             surface(1 / 30, 3.0, kind="toroidal", coefficients=[1 / 14, 1e-5], before=Pose(tilt_x=tilt)),
-            surface(None, 4.0, phase=rt.Grating(frequency, ONE), before=Pose(tilt_x=2 * tilt, y=tilt / 9)),
-            surface(0.02, 2.0, phase=rt.RadialPhase(terms, real(4.0), ONE), semi_diameter=30.0),
+            surface(None, 4.0, phase=rt.system.Grating(frequency, ONE), before=Pose(tilt_x=2 * tilt, y=tilt / 9)),
+            surface(0.02, 2.0, phase=rt.system.RadialPhase(terms, real(4.0), ONE), semi_diameter=30.0),
             IMAGE,
         ]
         end = trace(surfaces, rays)
@@ -143,7 +143,7 @@ def test_a_cone_at_its_vertex(engine, dtype):
 def test_an_ideal_lens_at_any_slope(engine, dtype, steep):
     """tan θ′ = tan θ - y/f, of any tan θ, forward and backward; a ray along the plane does not meet it, or goes on."""
     power = real(0.02).requires_grad_()
-    ideal = surface(None, 0.0, phase=rt.IdealLens(power, power))
+    ideal = surface(None, 0.0, phase=rt.system.IdealLens(power, power))
     rays = beam([0.0, 10.0, -4.0], slope=[steep, steep, 0.0])
     end = trace([ideal], rays, dtype=dtype)
     assert end.valid.all()
@@ -172,21 +172,21 @@ def test_a_surface_edge_on(engine, dtype, kind, name):
 
 def test_the_medium_continues_through_a_break_and_a_mirror_behind_it():
     """A Mangin mirror with a break inside its glass and one that undoes it is the one without."""
-    glass = rt.find_glass("N-BK7")
+    glass = rt.materials.find_glass("N-BK7")
     turn = {"x": 0.5, "tilt_x": 8.0, "tilt_y": -3.0}
-    there = rt.Surface(thickness=real(0.0), before=pose(**turn), is_break=True)
+    there = rt.system.Surface(thickness=real(0.0), before=pose(**turn), is_break=True)
     again = {name: -number for name, number in turn.items()}
-    back = rt.Surface(thickness=real(5.0), before=pose(**again, tilts_first=True), is_break=True)
+    back = rt.system.Surface(thickness=real(5.0), before=pose(**again, tilts_first=True), is_break=True)
     rows = [dict(radius=-80.0, thickness=5.0, glass=glass), dict(radius=-120.0, thickness=-5.0, glass="MIRROR")]
     plain = rt.lens([*rows, dict(radius=-80.0, thickness=-60.0)], stop=1, entrance_pupil_diameter=10, fields=[0, 2])
     front = plain.replace(1, thickness=real(0.0))
-    mirrored = rt.Surface(thickness=real(-5.0), before=pose(**again, tilts_first=True), is_break=True)
+    mirrored = rt.system.Surface(thickness=real(-5.0), before=pose(**again, tilts_first=True), is_break=True)
     surfaces = [
         *front.surfaces[:2], there, back,
         plain.replace(2, thickness=real(0.0)).surfaces[2], there, mirrored, *plain.surfaces[3:],
     ]  # fmt: skip
     broken = rt.Lens(**{**fields_of(plain), "surfaces": tuple(surfaces)})
-    ends = [rt.trace(lens, rt.rays(lens, pupil=rt.gauss_rings(3))) for lens in (plain, broken)]
+    ends = [rt.trace(lens, rt.tracing.rays(lens, pupil=rt.maths.gauss_rings(3))) for lens in (plain, broken)]
     assert ends[0].valid.all()
     assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-12)
     assert_close(ends[0].direction, ends[1].direction, rtol=0, atol=1e-14)
@@ -249,18 +249,20 @@ def some_of_all(scale: float) -> list[Surface]:
 
     turn = {"tilt_x": real(9.0), "tilt_y": real(-4.0), "tilt_z": real(30.0)}
     here = Pose(x=length(0.3), y=length(-0.2), z=length(0.1), **turn)
-    hologram = rt.Hologram(real([1.0, 2.0, -50.0]) * scale, real([0.0, -3.0, 80.0]) * scale, real(0.6), ONE)
-    radial = rt.RadialPhase(vector(-60.0, 20.0) * scale, length(5.0), ONE)
-    free = rt.PolynomialPhase(vector(9.0, -7.0, 5.0, 30.0, -20.0) * scale, length(5.0), ONE)
+    hologram = rt.system.Hologram(real([1.0, 2.0, -50.0]) * scale, real([0.0, -3.0, 80.0]) * scale, real(0.6), ONE)
+    radial = rt.system.RadialPhase(vector(-60.0, 20.0) * scale, length(5.0), ONE)
+    free = rt.system.PolynomialPhase(vector(9.0, -7.0, 5.0, 30.0, -20.0) * scale, length(5.0), ONE)
     return [
         surface(0.02 / scale, length(4.0), 1.5, kind="toroidal", coefficients=[0.03 / scale], before=here),
         surface(-0.01 / scale, length(5.0), kind="biconic", coefficients=[0.02 / scale, -0.5]),
-        surface(None, length(3.0), phase=rt.Grating(real(0.4), ONE), after=here),
+        surface(None, length(3.0), phase=rt.system.Grating(real(0.4), ONE), after=here),
         Surface(length(2.0), before=here, is_break=True),
         surface(0.01 / scale, length(2.0), phase=radial),
         surface(None, length(2.0), phase=free),
         surface(None, length(-6.0), MIRROR, phase=hologram),
-        surface(None, length(-9.0), phase=rt.IdealLens(real(0.01 / scale), real(0.02 / scale), real(0.003 / scale))),
+        surface(
+            None, length(-9.0), phase=rt.system.IdealLens(real(0.01 / scale), real(0.02 / scale), real(0.003 / scale))
+        ),
         IMAGE,
     ]
 
@@ -298,9 +300,9 @@ def test_derivatives_with_failed_rays_by_every_number(order, engine):
         tilted = Pose(**dict(zip(names, numbers, strict=True)))
         surfaces = [
             surface(radii[0], 3.0, 1.5, kind="toroidal", coefficients=radii[1:], semi_diameter=8.0),
-            surface(None, 3.0, phase=rt.Grating(frequency, ONE), before=tilted),
-            surface(0.01, 4.0, phase=rt.RadialPhase(terms, real(5.0), ONE), after=tilted),
-            surface(None, 3.0, phase=rt.Hologram(point, real([0.0, 3.0, 60.0]), real(0.5), ONE)),
+            surface(None, 3.0, phase=rt.system.Grating(frequency, ONE), before=tilted),
+            surface(0.01, 4.0, phase=rt.system.RadialPhase(terms, real(5.0), ONE), after=tilted),
+            surface(None, 3.0, phase=rt.system.Hologram(point, real([0.0, 3.0, 60.0]), real(0.5), ONE)),
             IMAGE,
         ]
         end = trace(surfaces, rays, index=[ONE, real(1.5), *[ONE] * 4])

@@ -138,13 +138,13 @@ def test_an_extension_mirrors_at_both_borders_and_tapers_without_a_jump():
 
 
 def test_mismatched_shapes_are_refused():
-    with pytest.raises(ValueError, match="a kernel of 9 × 3 pixels on a picture of 8 × 8"):
+    with pytest.raises(ValueError, match=r"9 × 3 pixels .* 8 × 8"):
         blur(torch.zeros(8, 8), torch.zeros(9, 3))
-    with pytest.raises(ValueError, match="boundary 'wrap': expected valid, circular"):
+    with pytest.raises(ValueError, match="'wrap': expected valid, circular"):
         blur(torch.zeros(8, 8), torch.zeros(3, 3), boundary="wrap")
-    with pytest.raises(ValueError, match=r"'grid' with a kernel of 4 × 3 .* expected odd sizes, or another boundary"):
+    with pytest.raises(ValueError, match=r"'grid' .* 4 × 3 .*odd sizes, or another boundary"):
         blur(torch.zeros(8, 8), torch.zeros(4, 3), origin="grid")
-    with pytest.raises(ValueError, match="a kernel of 9 × 9 pixels on a picture of 8 × 8"):
+    with pytest.raises(ValueError, match=r"9 × 9 pixels .* 8 × 8"):
         transfer_functions(torch.zeros(9, 9), 8)
     with pytest.raises(ValueError, match="finite, ascending"):
         depth_masks(torch.zeros(4, 4), torch.tensor([500.0, 1000.0, math.inf]))

@@ -354,7 +354,7 @@ def test_a_focal_length_is_held_with_pickups_by_a_number_that_they_leave_linear(
         float(first_order(changed).paraxial_image_distance.detach()), rel=1e-12
     )
     assert variables.numbers()["curvature_10"] == float(changed.surfaces[10].curvature)
-    with pytest.raises(BadVariables, match=r"none of the variables changes the focal length; .* whose pickups do not"):
+    with pytest.raises(BadVariables, match=r"none .*changes the focal length.*pickups"):
         Variables(lens, "curvature:3 curvature:8=-curvature:3", hold="efl")
 
 
@@ -385,7 +385,7 @@ def test_the_projection_follows_solves(lens):
 def test_a_state_says_what_follows(lens):
     state = Variables(lens, FOLLOWED).state_dict()
     other = Variables(lens, FOLLOWED.replace("=-curvature:3", "=-curvature:1"))
-    with pytest.raises(OtherLens, match=r"with the solves .*curvature of surface 8 = -1 × curvature of surface 3"):
+    with pytest.raises(OtherLens, match=r"surface 8 = -1 × curvature of surface 3"):
         other.load_state_dict(state)
 
 

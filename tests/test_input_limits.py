@@ -20,14 +20,14 @@ def test_rays_are_read_from_a_regular_file(path, tmp_path):
         path = tmp_path / "fifo"
         os.mkfifo(path)
     with pytest.raises(RayTableError, match="cannot be read: is not a regular file"):
-        rt.read_rays(path, SINGLET)
+        rt.io.read_rays(path, SINGLET)
 
 
 def test_a_table_of_rays_is_no_larger_than_its_bound(tmp_path):
     with open(tmp_path / "rays.csv", "wb") as file:
         file.truncate(2**30)  # a sparse file: no disk is used
     with pytest.raises(RayTableError, match="is larger than 256 MB"):
-        rt.read_rays(tmp_path / "rays.csv", SINGLET)
+        rt.io.read_rays(tmp_path / "rays.csv", SINGLET)
 
 
 @pytest.mark.parametrize(
@@ -53,8 +53,8 @@ def test_surfaces_are_counted_up_to_a_bound(numbers):
 @pytest.mark.parametrize(
     "rule",
     [
-        lambda: rt.gauss_rings(100_000),
-        lambda: rt.hexapolar(10**6),
+        lambda: rt.maths.gauss_rings(100_000),
+        lambda: rt.maths.hexapolar(10**6),
         lambda: rt.spot(SINGLET, sampling="square", points=10**7),
         lambda: rt.spot(SINGLET, sampling="sobol", points=10**12),
         lambda: rt.distortion(SINGLET, samples=10**12),

@@ -13,7 +13,7 @@ from raytrace.tolerancing.jacobian import OF_RAYS
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.trace import trace_lens
 
-FIELDS, PUPIL = [0.0, 6.0], rt.gauss_rings(2)
+FIELDS, PUPIL = [0.0, 6.0], rt.maths.gauss_rings(2)
 
 
 def model_of(lens: rt.Lens, vary: str) -> DesignVariables:
@@ -22,7 +22,7 @@ def model_of(lens: rt.Lens, vary: str) -> DesignVariables:
 
 
 def rays_behind(lens: rt.Lens, name: str) -> torch.Tensor:
-    launched = rt.rays(lens, fields=FIELDS, pupil=PUPIL)
+    launched = rt.tracing.rays(lens, fields=FIELDS, pupil=PUPIL)
     return OF_RAYS[name](trace_lens(aligned(lens, 3), launched, lens.wavelengths[:, None]))
 
 
@@ -65,7 +65,7 @@ KINDS = {
     "real aiming": (GAUSS.at(ray_aiming="real"), "curvature:1-3 thickness:4,5"),
     "real aiming of a tilted lens": (GAUSS.at(ray_aiming="real"), "tilt:2 decentre:9 curvature:1"),
     "clipped": (
-        COOKE.replace(1, semi_diameter=7.0, apertures=(rt.Aperture("circular", (0.0, 7.0)),)),
+        COOKE.replace(1, semi_diameter=7.0, apertures=(rt.system.Aperture("circular", (0.0, 7.0)),)),
         "curvature thickness",
     ),
 }
@@ -104,7 +104,7 @@ def test_derivatives_by_errors_are_their_differences(aiming):
     found = rt.jacobian(lens, tolerances=rows, fields=FIELDS, pupil=PUPIL)
     steps = torch.tensor([1e-3 * row.maximum for row in rows], dtype=torch.float64)
     landing = rays_behind(
-        rt.perturbed(lens, rows, torch.cat([torch.diag(steps), -torch.diag(steps)])), "landing points"
+        rt.tolerancing.perturbed(lens, rows, torch.cat([torch.diag(steps), -torch.diag(steps)])), "landing points"
     )
     plus, minus = landing.chunk(2, 1)
     difference = ((plus - minus) / (2 * steps.reshape(-1, 1, 1, 1))).movedim(1, 0)
@@ -230,7 +230,7 @@ def test_a_quantity_without_derivatives_is_reported():
 def test_derivatives_of_a_base_ray_are_its_gradients(name):
     """Its focal lengths follow from gradients that the function takes itself."""
     bent = GAUSS.replace(3, tilt_x=1.0)
-    assert_gradients(lambda lens: getattr(rt.base_ray(lens), name), bent, "curvature:1,3 tilt:3 decentre:5")
+    assert_gradients(lambda lens: getattr(rt.tracing.base_ray(lens), name), bent, "curvature:1,3 tilt:3 decentre:5")
 
 
 def test_wrong_quantities_are_refused():

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from problems import PICOMETRE, double_gauss, fields, lens, scalar, surface, vector
+from problems import PICOMETRE, double_gauss, fields, fisheye, lens, scalar, surface, vector
 
 import raytrace as rt
 from raytrace.maths.numerics import to
@@ -37,23 +37,6 @@ def aiming_error(system, rays, points=POINTS):
     """Largest distance at the stop to where the ray was aimed, in stop radii; rays not found left out."""
     found = at_stop(system, rays).position[:2] / stop_radius(system) - points[:, None, None]
     return torch.where(rays.valid, found, 0.0).abs().max().item()
-
-
-def fisheye(**others):
-    """Two negative menisci before a positive group; chief rays from 75° reach the stop, the pupil wanders."""
-    elements = [
-        surface(1 / 80, 4.0, 1.6),
-        surface(1 / 22, 22.0),
-        surface(1 / 150, 3.0, 1.6),
-        surface(1 / 20, 25.0),
-        surface(1 / 40, 8.0, 1.7),
-        surface(-1 / 60, 10.0),
-        surface(None, 4.0),
-        surface(-1 / 100, 3.0, 1.75),
-        surface(1 / 30, 8.0, 1.6),
-        surface(-1 / 25, 40.0),
-    ]
-    return lens(elements, **{"stop": 7, "aperture": ("entrance_pupil_diameter", 2.0), **others})
 
 
 def relay(back: float, distance: float, **others):
@@ -213,7 +196,7 @@ def test_a_lost_marginal_ray_leaves_the_others_aimed():
 
 
 def test_an_unknown_kind_of_aiming_is_refused():
-    with pytest.raises(ValueError, match="ray aiming 'on': expected one of auto, off, paraxial, real"):
+    with pytest.raises(ValueError, match=r"'on': expected .*auto, off, paraxial, real"):
         launch(double_gauss(), CENTRE, ray_aiming="on")
 
 
@@ -400,7 +383,7 @@ def test_every_field_of_a_tilted_object_is_a_point_of_an_untilted_one(ray_aiming
     spots, shape = rt.spot(tilted), rt.spot(system.at(object_distance=150 - z, fields=[y]))
     assert spots.rms_radius.item() == pytest.approx(shape.rms_radius.item(), rel=1e-9)
     assert spots.centroid[1].item() == pytest.approx(shape.centroid[1].item(), rel=1e-9)
-    merit = rt.Merit([rt.Row("RSCE", (8, 1), (0, 1.0), weight=1)])
+    merit = rt.Merit([rt.system.Row("RSCE", (8, 1), (0, 1.0), weight=1)])
     assert rt.evaluate(tilted, merit=merit).values.item() == pytest.approx(spots.rms_radius.item(), rel=1e-5)
     batch = rt.spot(system.replace(0, tilt_x=vector(0.0, 30.0))).rms_radius.flatten().tolist()
     assert batch == pytest.approx([rt.spot(lens).rms_radius.item() for lens in (system, tilted)], rel=1e-12)

@@ -2,7 +2,6 @@
 
 import ast
 import functools
-import gc
 import re
 import subprocess
 import sys
@@ -10,46 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-
-PACKAGE = Path(__file__).parents[1] / "raytrace"
-
-#: Layer of every package, a folder or a file directly under raytrace/; within one, imports have no cycles.
-FLOORS = {
-    # knows no optics: words of messages; files that travel with the package, processes that share one computation
-    "words": -2,
-    "files": -1,
-    "budget": -1,
-    "shards": -1,
-    # how figures look; a figure is drawn by its result
-    "plotting": 0,
-    "maths": 1,
-    "pages": 1,
-    "stores": 1,
-    "settings": 1,
-    # data and physics
-    "materials": 2,
-    "system": 3,
-    # lens files
-    "io": 4,
-    # computations
-    "tracing": 5,
-    "psf_models": 6,
-    "analysis": 7,
-    "wave_optics": 7,
-    "optimization": 8,
-    "tolerancing": 9,
-    "imaging": 10,
-    "viewer": 11,
-    # pages of experiments
-    "experiments": 12,
-    "cli": 13,
-    # measurements: nothing imports them
-    "bench": 14,
-    # the public API
-    "public": 15,
-    "__init__": 15,
-    "__main__": 15,
-}
+from layers import FLOORS, MODULES, PACKAGE, package_of, parsed
 
 #: Commands, whose imports may wait until they run.
 COMMANDS = re.compile(r"cli(\.|$)")
@@ -66,27 +26,10 @@ DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "u
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
-    "matplotlib": (r"bench\.figures",),
+    "matplotlib": (r"bench\.result",),
     "pandas": (r"io\.frames", r"cli"),
     "tqdm": (r"cli", r"bench"),
-    "optiland": (r"bench\.peers",),
 }
-
-
-def modules() -> dict[str, Path]:
-    found = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        name = ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
-        found[name] = path
-    return found
-
-
-MODULES = modules()
-
-
-def package_of(name: str) -> str:
-    return name.split(".")[0]
 
 
 def floor(name: str) -> int:
@@ -113,15 +56,6 @@ def imported(node: ast.AST) -> list[str]:
         name.removeprefix("raytrace.") if name.startswith("raytrace.") else re.sub(r"^io\b", "_io", name)
         for name in names
     ]
-
-
-@functools.cache
-def parsed(path: Path) -> ast.Module:
-    gc.disable()  # half the time of parsing
-    try:
-        return ast.parse(path.read_text(encoding="utf-8"))
-    finally:
-        gc.enable()
 
 
 @functools.cache
@@ -236,11 +170,11 @@ DISTRIBUTIONS = {"PIL": "pillow", "colour": "colour-science", "mpl_toolkits": "m
 
 
 def test_every_package_that_is_imported_is_declared():
-    """But for those of `bench`, which measures what is installed; viewer and measured cameras have extras."""
+    """Viewer and measured cameras have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [name for extra in ("view", "colour") for name in project["optional-dependencies"][extra]]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
-    library = (path for name, path in MODULES.items() if package_of(name) != "bench")
+    library = MODULES.values()
     roots = {name.split(".")[0] for path in library for name in imports(path)}
     others = roots - set(sys.stdlib_module_names) - {package_of(name) for name in MODULES} - {"raytrace"}
     assert {DISTRIBUTIONS.get(name, name) for name in others} <= declared

@@ -16,13 +16,13 @@ from raytrace.tracing.geometry import frames
 
 def folded(tilt_y: float = 0.0) -> rt.Lens:
     """A plano-convex lens, a fold by 90° and a tilted sensor."""
-    tilt = rt.Pose(tilt_x=45.0, tilt_y=tilt_y)
+    tilt = rt.system.Pose(tilt_x=45.0, tilt_y=tilt_y)
     return rt.lens(
         [
             dict(thickness=10.0),
             dict(radius=51.68, thickness=5.0, glass="N-BK7", semi_diameter=12.0),
             dict(thickness=40.0, semi_diameter=12.0),
-            dict(thickness=-56.0, glass="MIRROR", before=tilt, after=rt.Pose(tilt_x=45.0), semi_diameter=14.0),
+            dict(thickness=-56.0, glass="MIRROR", before=tilt, after=rt.system.Pose(tilt_x=45.0), semi_diameter=14.0),
         ],
         stop=1,
         entrance_pupil_diameter=16,
@@ -52,7 +52,7 @@ def test_rays_in_space_are_straight_between_surfaces_and_lie_on_them(tilt_y):
         for k, corner in zip(path.corners[1:], path.points.T[1:], strict=True):
             x, y, z = placed[k].inside(torch.tensor(corner))
             assert abs(float(z - sag_at(lens.surfaces[k], x, y))) < 1e-12
-    end = rt.trace(lens, rt.rays(lens, pupil=points))
+    end = rt.trace(lens, rt.tracing.rays(lens, pupil=points))
     drawn = np.array([path.points[:, -1] for path in found]).reshape(2, 10, 3)
     traced = placed[-1].outside(end.position[:, :, 0]).permute(1, 2, 0).numpy()
     assert np.abs(drawn - traced).max() < 1e-11
@@ -71,7 +71,7 @@ def test_the_fold_is_drawn_upward_and_seen_from_above_edge_on():
 
 
 def test_a_wedge_of_glass_is_bounded_by_its_tilted_faces():
-    there, back = rt.Pose(tilt_x=-20.0), rt.Pose(tilt_x=20.0)
+    there, back = rt.system.Pose(tilt_x=-20.0), rt.system.Pose(tilt_x=20.0)
     front = dict(thickness=10.0, glass="N-BK7", semi_diameter=5.0, before=there, after=back)
     prism = rt.lens([front, dict(thickness=30.0, semi_diameter=6.0, before=back)], stop=1, entrance_pupil_diameter=5)
     (glass,) = [patch for patch in rt.layout(prism).plot().axes[0].patches if str(patch.get_gid()) == "glass 1"]
@@ -100,8 +100,8 @@ def test_views_and_colours_by_wavelength(tmp_path):
 def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
     lens = rt.read_lens("cooke_triplet")
     for aperture in (
-        rt.Aperture("circular", (0.0, 1e6), False, (0.0, 1.0)),
-        rt.Aperture("circular", (12.0, 1e6), True),
+        rt.system.Aperture("circular", (0.0, 1e6), False, (0.0, 1.0)),
+        rt.system.Aperture("circular", (12.0, 1e6), True),
     ):
         first = dataclasses.replace(lens.surfaces[1], apertures=(aperture,))
         wide = dataclasses.replace(lens, surfaces=(lens.surfaces[0], first, *lens.surfaces[2:]))
@@ -113,7 +113,7 @@ def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
 
 def test_obscurations_are_seen_in_space(monkeypatch):
     lens = rt.read_lens("cooke_triplet")
-    vane = rt.Aperture("rectangular", (2.0, 6.0), True)
+    vane = rt.system.Aperture("rectangular", (2.0, 6.0), True)
     surface = dataclasses.replace(lens.surfaces[1], apertures=(vane,))
     lens, drawn = dataclasses.replace(lens, surfaces=(lens.surfaces[0], surface, *lens.surfaces[2:])), []
     monkeypatch.setattr(layout_3d, "_add_tiles", lambda axes, tiles, **look: drawn.append((look["facecolor"], tiles)))
@@ -126,7 +126,7 @@ def test_obscurations_are_seen_in_space(monkeypatch):
 
 
 def test_a_decentred_aperture_shows_that_part_of_a_mirror():
-    part = rt.Aperture("circular", (0.0, 54.0), False, (0.0, 100.0))
+    part = rt.system.Aperture("circular", (0.0, 54.0), False, (0.0, 100.0))
     mirror = dict(radius=-1000.0, conic=-1.0, thickness=-500.0, glass="MIRROR", apertures=(part,))
     tilted = rt.lens([dict(thickness=600.0), mirror], stop=1, entrance_pupil_diameter=300, fields=[0])
     (face,) = [line for line in rt.layout(tilted).plot().axes[0].lines if line.get_gid() == "mirror 2"]

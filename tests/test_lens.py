@@ -133,9 +133,9 @@ def test_weights_and_the_primary_wavelength_are_conditions():
     assert torch.equal(found.fields.vignetting, triplet.fields.vignetting)
     heavy = spot(found).whole.rms_radius
     assert not torch.allclose(heavy, spot(found.at(wavelength_weights=[1, 1])).whole.rms_radius)
-    with pytest.raises(ValueError, match="`wavelength_weights`: 2 found; expected 3, one for each wavelength"):
+    with pytest.raises(ValueError, match=r"`wavelength_weights`: 2 .*expected 3"):
         triplet.at(wavelength_weights=[1, 2])
-    with pytest.raises(ValueError, match=r"`field_weights` .*expected numbers from 0 up"):
+    with pytest.raises(ValueError, match=r"`field_weights` .*from 0 up"):
         triplet.at(field_weights=[1, -1, 0])
-    with pytest.raises(ValueError, match="primary wavelength number 3; expected one from 1 to 2"):
+    with pytest.raises(ValueError, match=r"primary wavelength number 3; .* 1 to 2"):
         found.at(primary_wavelength=3)

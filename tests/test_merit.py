@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import SHARED
 
 import raytrace as rt
 from raytrace.optimization.merit import UnknownOperand
 from raytrace.system.optimization_data import OptimizationData, Row
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+DEVELOPMENT = SHARED / "merit" / "dev"
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,7 @@ def test_configurations_are_distinguished(lens):
     assert float(alone.merit) == pytest.approx(two, rel=1e-12)
     joined = rt.Merit.default(zoom) + OWN
     assert rt.evaluate(zoom, merit=joined).configurations.tolist()[-1] == 1
-    rows = rt.evaluate(zoom, merit=rt.DefaultMerit("spot", edge=1.0), configuration=2)
+    rows = rt.evaluate(zoom, merit=rt.optimization.DefaultMerit("spot", edge=1.0), configuration=2)
     assert {*rows.configurations.tolist()} == {2}
 
 
@@ -154,15 +155,15 @@ def test_failed_rays_are_reported(lens):
 
 def test_long_tables_share_lines_and_list_every_row_when_asked(lens):
     together, every = (
-        str(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6), each=each)) for each in (False, True)
+        str(rt.evaluate(lens, merit=rt.optimization.DefaultMerit("spot", rings=6), each=each)) for each in (False, True)
     )
-    rows = len(rt.evaluate(lens, merit=rt.DefaultMerit("spot", rings=6)).row)
+    rows = len(rt.evaluate(lens, merit=rt.optimization.DefaultMerit("spot", rings=6)).row)
     assert len(every.splitlines()) == 3 + rows  # the merit, headings and units
     assert len(together.splitlines()) == 3 + 3
     assert str(rt.Merit.default(lens)).count("TRAC") == 21
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize(
     "name", ["Project_X__sc_schmidt3.ZMX", "Project_X__sc_scan3.ZMX", "Project_X__sc_maksutov2.zmx"]
 )

@@ -2,17 +2,19 @@
 
 import functools
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import SHARED
 
 import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.variables import DesignVariables
 
-FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+FOLDER = SHARED / "merit" / "dev"
+
+pytestmark = pytest.mark.needs(FOLDER)
 
 CLOSE = 1e-8  # relative
 NEAR_ZERO = {"OPDC": 1e-7, "OPDX": 1e-7, "OPDM": 1e-7}  # waves; lengths: 1e-9
@@ -35,7 +37,6 @@ def evaluation(name: str) -> Evaluation:
     return Evaluation(model, lens.optimization_data.merit, unit=lens.optimization_data.unit)
 
 
-@pytest.mark.skipif(not cases(), reason="the files are not here")
 def test_all_files_are_there():
     assert len(cases()) == 17
 
@@ -77,7 +78,7 @@ def test_a_file_holds_an_equality_as_a_row_of_negative_weight(tmp_path):
     """The constraint of `hold` in a file: met exactly in the optimisation that stores it and in that of its file."""
     lens, path = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial"), tmp_path / "held.zmx"
     spot = rt.Merit.default(lens, "spot", rings=2)
-    merit = rt.Merit([*spot.rows, rt.Row("EFFL", target=100.0, weight=-1.0)])
+    merit = rt.Merit([*spot.rows, rt.system.Row("EFFL", target=100.0, weight=-1.0)])
     first = rt.optimize(lens, merit=merit, vary="curvature sensor", cycles=6)
     first.save(path)
     again = rt.optimize(path, vary="thickness:2,6 curvature:1-4 sensor", cycles=6)

@@ -1,13 +1,12 @@
 """Operands of aberrations: against the analyses, stored figures, and derivatives against differences."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
-from problems import fields
+from problems import SHARED, fields
 
 import raytrace as rt
 from raytrace.analysis.seidel import OF_WAVEFRONT
@@ -20,7 +19,7 @@ from raytrace.tracing.paraxial import first_order
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
-STORED = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+STORED = SHARED / "merit" / "dev"
 SUMS = ("SPHA", "COMA", "ASTI", "FCUR")
 
 
@@ -197,7 +196,7 @@ def test_rows_that_a_lens_cannot_have(case):
         Evaluation(DesignVariables(lens), rows)
 
 
-@pytest.mark.skipif(not STORED.exists(), reason="needs the development files in ../shared")
+@pytest.mark.needs(STORED)
 def test_stored_colours_and_first_order():
     """Of an achromat, a relay and an objective, by an independent program."""
     achromat = rt.read_lens(STORED / "Project_X__AchromaticAt800nmF25mm.ZMX")

@@ -155,7 +155,7 @@ def test_rows_of_other_configurations():
     for i, step in enumerate((1e-7, 1e-4)):
         ahead, back = (Evaluation(model, rows)(model.start + side * step * np.eye(2)[i]).values[1] for side in (1, -1))
         assert found.jacobian[0, i] == pytest.approx((ahead - back) / (2 * step), rel=1e-6)
-    with pytest.raises(BadRow, match=r"CONF names configuration 3: this lens has configurations 1 to 2$"):
+    with pytest.raises(BadRow, match=r"CONF .*configuration 3: .*configurations 1 to 2$"):
         Evaluation(model, [Row("CONF", (3, 0))])
 
 
@@ -222,19 +222,19 @@ def test_a_circle():
 def test_rows_on_rows_that_are_skipped():
     model = model_of("thick lens")
     rows = [Row("WHAT"), Row("EFFL", weight=1.0), Row("ABSO", (1, 0)), Row("DIFF", (2, 3), weight=1.0)]
-    with pytest.raises(UnknownOperand, match=r"^row 4 .*: DIFF takes the value of row 3, ABSO, which has none; `skip_"):
+    with pytest.raises(UnknownOperand, match=r"^row 4 .*DIFF .* row 3, ABSO, .*`skip_"):
         Evaluation(model, rows)
     evaluation = Evaluation(model, rows, skip_unknown=True)
     assert evaluation.skipped == (1, 3, 4)
     assert evaluation(model.start).merit == pytest.approx(values_of("thick lens", [Row("EFFL")])[0])
     with pytest.raises(UnknownOperand, match=r"row 1 .*: operand WHAT is not known"):
         Evaluation(model, [Row("WHAT", weight=1.0)])
-    with pytest.raises(UnknownOperand, match=r"operand DISG is not known; .*; did you mean DIS"):
+    with pytest.raises(UnknownOperand, match=r"DISG .*did you mean DIS"):
         Evaluation(model, [Row("DISG", weight=1.0)])
 
 
 def test_one_argument_of_a_row_is_its_first():
     assert Row("OPLT", 3, 0.5) == Row("OPLT", (3, 0), (0.5, 0.0, 0.0, 0.0))
     assert Row("REAY", [4, 1], (0, 0.7)) == Row("REAY", (4, 1), (0, 0.7, 0.0, 0.0))
-    with pytest.raises(ValueError, match=r"row REAY: `integers` \(1, 2, 3\): expected at most 2"):
+    with pytest.raises(ValueError, match=r"REAY: `integers` .*at most 2"):
         Row("REAY", (1, 2, 3))

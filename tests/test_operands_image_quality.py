@@ -106,7 +106,7 @@ def test_spots_are_in_the_unit_of_the_rows_and_waves_are_waves():
 
 
 def test_no_rings_are_an_error():
-    with pytest.raises(BadRow, match=r"row 1 .*RSCE asks for no rays: give 1 ring or more"):
+    with pytest.raises(BadRow, match=r"row 1 .*RSCE .*1 ring or more"):
         values(rt.read_lens("singlet"), [Row("RSCE", (0, 1))])
 
 
@@ -312,7 +312,7 @@ def test_a_function_that_has_no_number_at_first_is_an_error_and_later_a_lost_row
         return lens.surfaces[-2].thickness
 
     evaluation = Evaluation(model, [Row(near, weight=1.0)])
-    with pytest.raises(BadRow, match=r"row 1 .*near.* has no value: too far away"):
+    with pytest.raises(BadRow, match=r"row 1 .*near.* too far away"):
         evaluation(np.array([61.0]))
     assert evaluation(np.array([50.0]), derivatives=True).jacobian.tolist() == [[1.0]]
     found = evaluation(np.array([61.0]), derivatives=True)
@@ -321,7 +321,7 @@ def test_a_function_that_has_no_number_at_first_is_an_error_and_later_a_lost_row
 
 
 def test_a_function_that_gives_no_numbers_is_refused():
-    with pytest.raises(TypeError, match=r"row 1 .*\[2, 2\], expected a tensor \(\) or \(k,\)"):
+    with pytest.raises(TypeError, match=r"row 1 .*\[2, 2\], expected .*\(k,\)"):
         values(rt.read_lens("cooke_triplet"), [Row(lambda lens: torch.ones(2, 2), weight=1.0)])
 
 
@@ -330,7 +330,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     """Its row has a name in every result; in a lens file a text replaces it, with a warning."""
     lens = rt.read_lens("cooke_triplet")
     found = rt.optimize(
-        lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=2
+        lens, merit=[rt.system.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.system.Vary(6, "thickness")], cycles=2
     )
     assert found.merit_after < 0.999 * found.merit_before
     document = json.loads(json.dumps(found.document()))["operands"][0]

@@ -61,7 +61,7 @@ def test_the_angle_to_the_axis_is_that_of_the_cosines():
 def test_directions_behind_a_telescope_are_those_of_its_defocus():
     """Two ideal lenses f1 + f2 + δ apart turn a ray at height y by the slope δ y/(f1 f2): the cosine is its sine."""
     first, second, defocus, radius = 100.0, 25.0, 0.4, 5.0
-    ideal = [rt.IdealLens(1 / f, 1 / f) for f in (first, second)]
+    ideal = [rt.system.IdealLens(1 / f, 1 / f) for f in (first, second)]
     surfaces = [dict(thickness=first + second + defocus, phase=ideal[0]), dict(thickness=20.0, phase=ideal[1])]
     lens = rt.lens(surfaces, stop=1, entrance_pupil_diameter=2 * radius, fields=[0], wavelengths=[0.55])
     rows = [Row(o, (0, 1), (0.0, 0.0, 0.0, py)) for o in ("ANAC", "ANAR", "ANCY", "ANAY") for py in (0.5, 1.0)]

@@ -2,15 +2,14 @@
 
 import itertools
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from bends import folded
 from differences import slopes_by_differences
+from problems import SHARED, surface, values, vector
 from problems import lens as lens_of
-from problems import surface, values, vector
 
 import raytrace as rt
 from raytrace.optimization.merit import Evaluation
@@ -25,7 +24,7 @@ from raytrace.tracing.scene import scene
 from raytrace.tracing.trace import lens_steps, trace_lens
 from raytrace.tracing.wavefront import path_to_reference_sphere, wavefront_of
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+DEVELOPMENT = SHARED / "merit" / "dev"
 WAVES = 1e-7  # what the oracle is held to
 
 POINTS = [(0.0, 0.0), (0.0, 0.95), (0.5, -0.4), (-0.3, 0.7), (0.8, 0.1), (0.0, -0.6), (0.6, 0.6), (-0.9, 0.2)]
@@ -38,7 +37,7 @@ def rows(operand: str, *, wavelengths=(1, 2, 3), fields=FIELDS, points=POINTS) -
     return [Row(operand, (0, w), (*h, *p), weight=0.5 + 0.1 * (k % 7)) for k, (w, h, p) in enumerate(asked)]
 
 
-def beam(lens: rt.Lens, w: int, field, points) -> tuple[rt.Rays, torch.Tensor, torch.Tensor]:
+def beam(lens: rt.Lens, w: int, field, points) -> tuple[rt.system.Rays, torch.Tensor, torch.Tensor]:
     """Rays on the image of one wavelength and field (part of the largest), the index there and the wavelength."""
     largest = torch.hypot(lens.fields.x, lens.fields.y).max()
     at, wavelength = largest * vector(*field)[:, None], lens.wavelengths[w]
@@ -214,7 +213,7 @@ def test_the_sign_of_a_longer_path():
 
 
 def test_a_reading_that_is_not_known_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': expected one of per wavelength, common"):
+    with pytest.raises(ValueError, match=r"`opd_tilt` 'mine': .*per wavelength, common"):
         Conventions(opd_tilt="mine")
 
 
@@ -246,7 +245,7 @@ def paths_between_hits(lens: rt.Lens, w: int, field, point) -> tuple[list[float]
 def test_paths_are_sums_of_index_times_distance(name, distance):
     lens = rt.read_lens(name)
     if np.isfinite(distance):
-        lens = rt.with_object_distance(lens, torch.tensor(distance).double())
+        lens = rt.system.with_object_distance(lens, torch.tensor(distance).double())
     last, w = len(lens.surfaces) - 1, len(lens.wavelengths) - 1
     numbers = (0.3, 0.5, 0.4, -0.6)
     legs, first = paths_between_hits(lens, w, numbers[:2], numbers[2:])
@@ -275,7 +274,7 @@ def test_paths_in_inches():
 def test_a_surface_that_is_not_there_is_named():
     lens = rt.read_lens("cooke_triplet")
     last = len(lens.surfaces) - 1
-    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH names surface 40: this lens has surfaces 0 to {last}"):
+    with pytest.raises(BadRow, match=rf"^row 1 .*OPTH .*surface 40: .*surfaces 0 to {last}"):
         values(lens, [Row("OPTH", (40, 1))])
 
 
@@ -309,7 +308,7 @@ def test_derivatives_with_failed_rays(operand, conventions):
 
 def test_derivatives_of_a_path_from_an_object_that_moves():
     """The launch moves with the object, the entrance pupil and the focal length."""
-    lens = rt.with_object_distance(rt.read_lens("cooke_triplet"), torch.tensor(300.0).double())
+    lens = rt.system.with_object_distance(rt.read_lens("cooke_triplet"), torch.tensor(300.0).double())
     model = DesignVariables(lens, (Vary(0, "thickness"), Vary(1, "curvature"), Vary(2, "thickness")))
     numbers = (0.3, 0.5, 0.4, -0.6)
     asked = [Row("OPTH", (s, 3), numbers, weight=1.0) for s in (1, 3, 7)] + [Row("OPDC", (0, 1), numbers, weight=1.0)]
@@ -332,7 +331,7 @@ def test_derivatives_of_a_bent_lens():
 # -- oracle ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize("name", ["Apochromat3.zmx", "sc_maksutov2.zmx", "sc_schmidt3.ZMX", "sc_slit.ZMX"])
 def test_stored_designs_agree_with_the_oracle(name):
     """In size: which sign a longer path has is not settled."""

@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize
 from scripts import script
 
@@ -177,8 +177,10 @@ def test_a_limit_is_kept_where_it_is_in_the_way_and_is_let_go_where_it_is_not(tr
 def test_both_engines_end_at_the_same_lens(triplet):
     ends = []
     for engine in ("eager", "auto"):
-        with rt.trace_engine(engine):
-            found = rt.optimize(triplet, merit=rt.DefaultMerit("spot", rings=2), vary="curvature:1-3 sensor")
+        with rt.tracing.trace_engine(engine):
+            found = rt.optimize(
+                triplet, merit=rt.optimization.DefaultMerit("spot", rings=2), vary="curvature:1-3 sensor"
+            )
             ends.append(found.variables_after)
     assert torch.allclose(*ends, rtol=1e-6, atol=1e-9)
 
@@ -225,7 +227,7 @@ def test_boundaries_end_a_descent_without_chattering(triplet):
     """Thicknesses come to rest where the rest of the merit presses them, each within a few steps of its boundary."""
     found = rt.optimize(
         triplet,
-        merit=rt.DefaultMerit("spot", glass_thickness="2:9", air_thickness="0.5:90", edge=1.0),
+        merit=rt.optimization.DefaultMerit("spot", glass_thickness="2:9", air_thickness="0.5:90", edge=1.0),
         vary="curvature thickness",
         hold=[Condition(Row("EFFL", target=101.2))],
     )
@@ -344,7 +346,7 @@ def test_errors_of_optimize_are_one_line(words, said, command_line):
 
 
 def test_a_merit_without_weight_and_one_without_light_are_refused(triplet):
-    with pytest.raises(NoProblem, match="no row of the merit function has a weight"):
+    with pytest.raises(NoProblem, match=r"no row .* has a weight"):
         rt.optimize(triplet, merit=[Row("EFFL")], vary="curvature")
     row = Row("TRAC", (0, 1), (0.0, 0.0, 0.0, 40.0), weight=1.0)
     with pytest.raises(NoProblem, match="no ray"):
@@ -363,7 +365,7 @@ def test_the_figure_shows_before_and_after(triplet, tmp_path):
 
 # -- files with a merit function, where they are at hand ---------------------------------------------------------------
 
-FILES = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+FILES = SHARED / "merit" / "dev"
 KNOWN = json.loads((FILES / "oracle.json").read_text())["files"] if (FILES / "oracle.json").exists() else []
 QUICK = ("sc_hamm2", "Schmidt-Cassegrain", "sc_slit", "PyZDDE__Doublet", "sc_cooke2", "AchromaticAt800")
 
@@ -376,6 +378,7 @@ def of_files():
             yield pytest.param(known, marks=marks, id=known["file"])
 
 
+@pytest.mark.needs(FILES)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("known", [*of_files()])
 def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(known):
@@ -431,22 +434,24 @@ def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_opti
     state = problem.state(problem.model.start, True)
     assert state.lost
     assert np.isfinite(state.jacobian).all()
-    found = rt.optimize(lens, merit=rt.DefaultMerit("spot", rings=1, arms=2), vary="curvature:1", cycles=1)
+    found = rt.optimize(lens, merit=rt.optimization.DefaultMerit("spot", rings=1, arms=2), vary="curvature:1", cycles=1)
     assert "nan" not in str(found)
     assert "DLASCL" not in capfd.readouterr().out
 
 
 def test_a_row_without_a_derivative_is_refused_with_its_name(triplet):
     """0 · ∞, where a root begins."""
-    bad = Row(rt.Measure("bad", lambda lens: 1 + (0 * lens.surfaces[1].curvature).abs().sqrt()), weight=1.0)
-    with pytest.raises(NoProblem, match="row 1 of the merit function, bad, has no derivative by curvature_1"):
+    bad = Row(
+        rt.optimization.Measure("bad", lambda lens: 1 + (0 * lens.surfaces[1].curvature).abs().sqrt()), weight=1.0
+    )
+    with pytest.raises(NoProblem, match=r"row 1 .*bad, .*derivative by curvature_1"):
         rt.optimize(triplet, merit=[bad], vary="curvature:1", cycles=1)
 
 
 def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
     """Rows without a weight are shown at both ends alone; those that a row of arithmetic takes are evaluated."""
     called = []
-    idle = Row(rt.Measure("idle", lambda lens: called.append(1) or lens.surfaces[1].curvature))
+    idle = Row(rt.optimization.Measure("idle", lambda lens: called.append(1) or lens.surfaces[1].curvature))
     rows = [*DefaultMerit(rings=1, arms=2).rows(triplet), idle]
     found = rt.optimize(triplet, merit=rows, vary="curvature:1-3", cycles=6)
     assert found.values_after[-1] == pytest.approx(float(found.lens.surfaces[1].curvature))
@@ -489,7 +494,7 @@ def test_an_mtf_that_starts_near_zero_is_reported():
     """Through spots first the same merit function ends far lower, and the line is gone."""
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="paraxial", fields=[0.0, 8.4])
     unsharp = lens.at(sensor_distance=lens.surfaces[-2].thickness + 2)
-    mtf = dict(merit=rt.DefaultMerit("mtf", frequencies=[20]), vary="sensor")
+    mtf = dict(merit=rt.optimization.DefaultMerit("mtf", frequencies=[20]), vary="sensor")
     stuck = rt.optimize(unsharp, **mtf)
     better = rt.optimize(rt.optimize(unsharp, merit="spot", vary="sensor").lens, **mtf)
     assert "2 of 2 rows of the MTF start below 0.1, where it hardly has a slope: minimise `merit=spot` first" in str(

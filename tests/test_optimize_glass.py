@@ -34,7 +34,7 @@ from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
-MERIT = rt.DefaultMerit("spot", glass_thickness=(2.0, 20.0), air_thickness=(0.3, 100.0), edge=1.0)
+MERIT = rt.optimization.DefaultMerit("spot", glass_thickness=(2.0, 20.0), air_thickness=(0.3, 100.0), edge=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import warnings
 import pytest
 import torch
 from problems import rotation
+from problems_oslo import CONIC, FAR, SINGLET, double_gauss, text
 
 import raytrace as rt
 from raytrace.analysis.seidel import seidel
@@ -25,14 +26,6 @@ from raytrace.tracing.geometry import frames
 from raytrace.tracing.scene import scene
 from raytrace.tracing.wavefront import wavefront_of
 
-FAR = "TH 1e20"
-
-
-def text(surfaces, *system, title="x", stated="", tail="", waves="WV 0.58756; WW 1", end=None) -> str:
-    """A lens file: commands of each surface from the object to the one before the image, then those of the image."""
-    lines = [f'LEN NEW "{title}" {stated}', *system, *(f"{surface}; NXT" for surface in surfaces), waves]
-    return "\n".join([*lines, f"END {len(surfaces) if end is None else end}", tail]) + "\n"
-
 
 def read(*arguments, strict=False, **options):
     return FORMATS[".len"].read(text(*arguments, **options), "lens.len", strict=strict)
@@ -44,9 +37,6 @@ def lens(*arguments, **options):
 
 def focal_length(found) -> float:
     return float(rt.first_order(found).effective_focal_length)
-
-
-SINGLET = ("TH 1e20", "RD 50; GLA N-BK7; TH 4; AP 6", "RD -50; TH 47.5; AST")
 
 
 # -- figures of OSLO --------------------------------------------------------------------------------------------------
@@ -168,8 +158,6 @@ def test_focal_length_of_the_lens_of_elphel():
     assert {one.name: one.status for one in report.keywords}["V"] == "ignored"
 
 
-#: What OSLO printed: SA3, CMA3, AST3, PTZ3, DIS3 of every surface with power.
-CONIC = ("RD 50; GLA N-BK7; CC -0.6; AD -6e-7; AE 2.5e-10; AF -8e-14; AP CHK 10.1; TH 6", "RD -200; AP CHK 10.1; TH 76")
 SEIDEL = {
     "a conic singlet with r⁴": (
         ("AST; AP CHK 10; TH 0", *CONIC),
@@ -223,19 +211,6 @@ def opd(found, wavelength: float, points) -> list[float]:
     return (-1e3 / wavelength * wavefront_of(view, torch.stack([0 * y, y])).opd).flatten().tolist()
 
 
-def double_gauss(waves: str) -> str:
-    """That of Kingslake."""
-    return text(
-        (
-            *(FAR, "RD 25.907; GLA SK4; TH 5.083", "RD 147.341; TH 2.355", "RD 34.804; GLA F4; TH 1.694"),
-            *("RD 17.34; TH 2.542", "AST; TH 2.542", "RD -17.34; GLA F4; TH 1.694", "RD -34.8; TH 2.355"),
-            *("RD -138.87; GLA SK4; TH 5.083", "RD -24.53; TH 89.832"),
-        ),
-        "UNI 1.0; EBR 6.25; ANG 14",
-        waves=waves,
-    )
-
-
 @pytest.mark.filterwarnings("ignore")
 def test_path_differences_in_waves_are_those_that_oslo_traces():
     """UNI 1 is a millimetre: paths are in waves."""
@@ -249,7 +224,7 @@ def test_the_first_wavelength_is_the_primary_one():
     """OSLO's chief ray of 14°, mm: of the F line where that is the first wavelength."""
     for waves, height in (("0.48613 0.58756 0.65627", 24.945679), ("0.58756 0.48613 0.65627", 24.9495)):
         found = FORMATS[".len"].read(double_gauss(f"WV {waves}; WW 1 1 1"), "lens.len")[0].at(ray_aiming="real")
-        rays = rt.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
+        rays = rt.tracing.rays(found, fields=[14], pupil=torch.zeros(2, 1, dtype=torch.float64))
         end = rt.trace(found, rays)
         digits = len(str(height).partition(".")[2])
         assert round(float(end.position[1].flatten()[found.primary_wavelength - 1]), digits) == pytest.approx(
@@ -354,7 +329,7 @@ def test_a_mirror_that_bends_the_axis():
     """Optiland's tests: behind a mirror of TLA 45 with BEN, TH -10 leads to 0, -10, 0, and the ray with it."""
     found = lens((FAR, "RFH; TLA 45; BEN; TH -10"), "EBR 1")
     assert frames(found)[2].origin.tolist() == pytest.approx([0, -10, 0], abs=1e-14)
-    end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+    end = rt.trace(found, rt.tracing.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
     assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-14)
     assert end.direction.flatten().abs().tolist() == pytest.approx([0, 0, 1], abs=1e-14)
 
@@ -396,7 +371,7 @@ def test_the_pentaprism_of_the_user_guide():
         corner = leaving.origin - entrance.origin
         assert abs(float(corner @ entrance.axes[:, 2])) == pytest.approx(1, abs=1e-5)
         assert abs(float(corner @ leaving.axes[:, 2])) == pytest.approx(1, abs=1e-5)
-        end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+        end = rt.trace(found, rt.tracing.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
         if not tilt:
             assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-5)
 
@@ -652,10 +627,10 @@ def test_a_binary_file_is_named_as_one_of_code_v(tmp_path):
     """CODE V saves lenses under the same suffix; a damaged text is none."""
     path = tmp_path / "lens.len"
     path.write_bytes(b"CODEV\0\0\1" + bytes(range(256)) * 8)
-    with pytest.raises(LensFileError, match=r"lens\.len: is binary: a \.len file of CODE V.*sequence file \(\.seq\)"):
+    with pytest.raises(LensFileError, match=r"lens\.len: is binary: .*CODE V.*\.seq"):
         read_lens(path)
     path.write_text("RDM;LEN\nSO 0 1e13\nS 50 4 NBK7\nSI 0 0\n")
-    with pytest.raises(LensFileError, match=r"the commands are those of CODE V: rename the file to \.seq"):
+    with pytest.raises(LensFileError, match=r"CODE V: rename the file to \.seq"):
         read_lens(path)
     path.write_bytes(text(SINGLET).encode() + b"\x07\n")
     with pytest.raises(LensFileError, match=r"holds the character U\+0007"):

@@ -49,7 +49,7 @@ def lens(tmp_path):
         ("trace lens.zmx --rays rays.csv -o rays.csv", "rays.csv: is the file of --rays too"),
         ("search lens.zmx --merit spot --vary curvature -o lens.zmx", "lens.zmx: is a file; give the name of a folder"),
         ("wave psf --element e.json --aperture 1 --plot no/x.png", "no/x.png: cannot be written"),
-        ("bench trace --csv no/x.csv", "no/x.csv: cannot be written"),
+        ("bench trace -o no/x.csv", "no/x.csv: cannot be written"),
         ("codesign lens.zmx -o lens.zmx", "lens.zmx: is the file of LENS too"),
     ],
 )

@@ -25,11 +25,11 @@ def some(count: int, seed: int = 0) -> torch.Tensor:
 
 
 PHASES = {
-    "grating": rt.Grating(real(0.3), real(-1.0)),
-    "radial": rt.RadialPhase(300 * some(3), real(5.0), real(1.0)),
-    "polynomial": rt.PolynomialPhase(300 * some(9), real(4.0), real(-1.0)),
-    "fringe": rt.FringePhase(20 * some(37), real(6.0), real(1.0)),
-    "hologram": rt.Hologram(real([1.0, 2.0, -50.0]), real([0.0, -3.0, 80.0]), real(0.6328), real(1.0)),
+    "grating": rt.system.Grating(real(0.3), real(-1.0)),
+    "radial": rt.system.RadialPhase(300 * some(3), real(5.0), real(1.0)),
+    "polynomial": rt.system.PolynomialPhase(300 * some(9), real(4.0), real(-1.0)),
+    "fringe": rt.system.FringePhase(20 * some(37), real(6.0), real(1.0)),
+    "hologram": rt.system.Hologram(real([1.0, 2.0, -50.0]), real([0.0, -3.0, 80.0]), real(0.6328), real(1.0)),
 }
 
 
@@ -57,11 +57,11 @@ def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
     """Zernike's first fringe term: λ times the order, along every ray, in both engines."""
 
     def path(piston):
-        phase = rt.FringePhase(torch.stack([piston, *real([0.0, 0.3, 0.2]).unbind()]), real(6.0), real(2.0))
+        phase = rt.system.FringePhase(torch.stack([piston, *real([0.0, 0.3, 0.2]).unbind()]), real(6.0), real(2.0))
         surfaces = [Surface(real(5.0), phase=phase), Surface(real(0.0))]
         x = torch.linspace(-3, 3, 4096, dtype=torch.float64)
         rays = start(torch.stack([x, 0.1 * x, 0 * x]), torch.stack([0 * x, 0 * x, 1 + 0 * x]), 0 * x)
-        with rt.trace_engine(engine):
+        with rt.tracing.trace_engine(engine):
             return trace_surfaces(surfaces, rays, indices=[real(1.0)] * 3, wavelength=WAVELENGTH).opl
 
     piston = real(1.0).requires_grad_()
@@ -135,7 +135,7 @@ def plane_wave(count: int = 12, size: float = 4.0, slope: float = 0.05):
 @pytest.mark.parametrize("mirror", [False, True])
 def test_malus_law(name, mirror):
     """Behind a phase rays stay normal to surfaces of equal path: ∂(path)/∂(start) = n d · ∂P/∂(start)."""
-    glass = rt.MIRROR if mirror else rt.AIR
+    glass = rt.materials.MIRROR if mirror else rt.materials.AIR
     surfaces = [
         Surface(thickness=real(-9.0 if mirror else 9.0), curvature=real(0.02), phase=PHASES[name], glass=glass),
         Surface(thickness=real(0.0)),
@@ -170,7 +170,7 @@ def lens_of(phase, *, object_distance: float, image: float, field: float = 0.0) 
 )
 def test_an_ideal_lens_has_no_aberrations_at_its_conjugate(distance, field):
     image = 50.0 if math.isinf(distance) else 1 / (1 / 50 - 1 / distance)
-    lens = lens_of(rt.IdealLens(0.02, 0.02), object_distance=distance, image=image, field=field)
+    lens = lens_of(rt.system.IdealLens(0.02, 0.02), object_distance=distance, image=image, field=field)
     assert abs(float(rt.first_order(lens).effective_focal_length) - 50) < 1e-12
     spot = rt.spot(lens)
     assert float(spot.rms_radius.max()) < 1e-11
@@ -181,15 +181,17 @@ def test_an_ideal_lens_has_no_aberrations_at_its_conjugate(distance, field):
 def test_a_diffractive_lens_focuses_by_its_wavelength():
     """A₁ = -π R²/(λ f): at another wavelength the focal length goes with 1/λ."""
     a1 = -math.pi * 25 / (0.55e-3 * 100)
-    lens = lens_of(rt.RadialPhase([a1], 5.0, 1.0), object_distance=math.inf, image=100.0)
+    lens = lens_of(rt.system.RadialPhase([a1], 5.0, 1.0), object_distance=math.inf, image=100.0)
     assert abs(float(rt.first_order(lens).effective_focal_length) - 100) < 1e-10
     other = rt.first_order(lens, real(0.5))
     assert abs(float(other.effective_focal_length) - 110) < 1e-10
 
 
 def test_facets_bend_as_the_surface_above_the_plane():
-    ball = Surface(thickness=real(20.0), curvature=real(1 / 40), conic=real(-1.0), glass=rt.find_glass("N-BK7"))
-    flat = dataclasses.replace(ball, phase=rt.Facets())
+    ball = Surface(
+        thickness=real(20.0), curvature=real(1 / 40), conic=real(-1.0), glass=rt.materials.find_glass("N-BK7")
+    )
+    flat = dataclasses.replace(ball, phase=rt.system.Facets())
     n, rays = [real(1.0), real(1.5), real(1.5)], plane_wave(slope=0.0)
     image = Surface(thickness=real(0.0))
     curved = trace_surfaces([ball], rays, indices=n[:2])
@@ -210,7 +212,11 @@ def test_beyond_the_edge_of_its_conic_a_fresnel_lens_loses_light_and_has_no_deri
     x = torch.tensor([1.0, 10.5, 40.0], dtype=torch.float64, requires_grad=True)
     curvature, conic = (torch.tensor(n, dtype=torch.float64, requires_grad=True) for n in (0.1, 0.0))
     flat = Surface(
-        thickness=real(5.0), curvature=curvature, conic=conic, phase=rt.Facets(), glass=rt.find_glass("N-BK7")
+        thickness=real(5.0),
+        curvature=curvature,
+        conic=conic,
+        phase=rt.system.Facets(),
+        glass=rt.materials.find_glass("N-BK7"),
     )
     zero = torch.zeros_like(x)
     rays = start(torch.stack([x, zero, zero]), torch.stack([zero, zero, zero + 1]), real(0.0))
@@ -234,7 +240,13 @@ def rays_of(rays, count):
 def test_facets_of_a_mirror_reflect_as_the_mirror_above_the_plane(engine, monkeypatch):
     """A parabola in facets: light along the axis crosses it at half the radius, 20 mm, less what the plane is lower."""
     monkeypatch.setenv("RAYTRACE_TRACE", engine)
-    bowl = Surface(thickness=real(0.0), curvature=real(-1 / 40), conic=real(-1.0), glass=rt.MIRROR, phase=rt.Facets())
+    bowl = Surface(
+        thickness=real(0.0),
+        curvature=real(-1 / 40),
+        conic=real(-1.0),
+        glass=rt.materials.MIRROR,
+        phase=rt.system.Facets(),
+    )
     height = torch.linspace(1.0, 10.0, 32, dtype=torch.float64)
     zero = torch.zeros_like(height)
     rays = start(torch.stack([zero, height, zero]), torch.stack([zero, zero, zero + 1]), real(0.0))
@@ -266,12 +278,12 @@ def test_the_path_of_an_ideal_lens_is_smooth_in_both_powers(engine):
     """By one power alone, at equal ones, a derivative is that of differences: the path has no jump there."""
 
     def total(power_x, power_y):
-        lens = lens_of(rt.IdealLens(power_x, power_y), object_distance=80.0, image=60.0, field=3.0)
+        lens = lens_of(rt.system.IdealLens(power_x, power_y), object_distance=80.0, image=60.0, field=3.0)
         rays = launch(lens, points.expand(2, -1))
-        with rt.trace_engine(engine):
+        with rt.tracing.trace_engine(engine):
             return trace_lens(lens, rays, lens.wavelengths[:, None]).opl.sum()
 
-    points = rt.gauss_rings(4, dtype=torch.float64)[0].repeat(1, 100)  # as many as the compiled trace is worth
+    points = rt.maths.gauss_rings(4, dtype=torch.float64)[0].repeat(1, 100)  # as many as the compiled trace is worth
     powers = [torch.tensor(0.02, dtype=torch.float64, requires_grad=True) for _ in range(2)]
     found = torch.autograd.grad(total(*powers), powers)
     step = 1e-6

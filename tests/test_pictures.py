@@ -53,7 +53,7 @@ def test_folders_without_pictures_are_reported(folder, tmp_path):
     with pytest.raises(NoPictures, match="none of 1 pictures has 84 × 84"):
         read([folder / "small.png"], least=84)
     (folder / "broken.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match=r"broken\.png: cannot be read as a picture"):
+    with pytest.raises(ValueError, match=r"broken\.png: cannot be read"):
         read([folder / "broken.png"], least=84)
 
 
@@ -169,7 +169,7 @@ def test_grey_dead_leaves_are_those_of_earlier_versions():
 
 
 def test_other_correlations_are_refused():
-    with pytest.raises(ValueError, match=r"correlation 1\.5 of colours: expected 0 to 1"):
+    with pytest.raises(ValueError, match=r"1\.5 .*expected 0 to 1"):
         dead_leaves(1, size=8, colour=True, correlation=1.5)
 
 
@@ -238,7 +238,7 @@ def test_colours_of_16_bits_keep_them(tmp_path, channels, kind):
 def test_layouts_of_16_bits_that_would_lose_bits_are_refused(tmp_path):
     """Grey with alpha, of which PIL keeps 8 bits; as grey of 8 bits, which training takes, it is read."""
     (tmp_path / "a.png").write_bytes(png(draws(3).integers(0, 2**16, (6, 7, 2)).astype(np.uint16)))
-    with pytest.raises(ValueError, match=r"a\.png: pixels of the layout LA with 16 bits; expected grey or RGB ones"):
+    with pytest.raises(ValueError, match=r"a\.png: .*LA with 16 bits; expected grey or RGB"):
         read_levels(tmp_path / "a.png")
     assert read([tmp_path / "a.png"], least=4).samples[0].shape == (6, 7)
 
@@ -249,7 +249,7 @@ def test_exif_orientation_is_applied_and_alpha_shown_on_black(tmp_path):
     exif = picture.getexif()
     exif[0x0112] = 6  # turned by 90°
     picture.save(tmp_path / "a.png", exif=exif)
-    with pytest.warns(PictureChanged, match=r"a\.png: turned upright, by its EXIF orientation 6"):
+    with pytest.warns(PictureChanged, match=r"a\.png: .*EXIF orientation 6"):
         np.testing.assert_array_equal(read_colour(tmp_path / "a.png"), np.rot90(values, -1))
     alpha = np.dstack([values, np.full((4, 6), 255, np.uint8)])
     alpha[0, 0, 3] = 0
@@ -273,8 +273,8 @@ def test_webp_and_floating_point_tiff(tmp_path):
     distances = np.float32(800 + 4000 * light[:1])
     write_light(tmp_path / "depth.tif", distances)
     np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), distances[0])
-    with pytest.raises(ValueError, match="floating-point distances in mm need no `depth_range`"):
+    with pytest.raises(ValueError, match=r"distances in mm .*`depth_range`"):
         read_depth(tmp_path / "depth.tif", (1.0, 2.0))
     (tmp_path / "b.png").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="no picture of a layout that is read: expected JPEG, PNG, WEBP, BMP, TIFF"):
+    with pytest.raises(ValueError, match="expected JPEG, PNG, WEBP, BMP, TIFF"):
         read_levels(tmp_path / "b.png")

@@ -37,7 +37,7 @@ def test_right_angles_are_exact():
     assert [float(c) for c in direction_in(pose(tilt_y=180.0), z_axis)] == [0.0, 0.0, -1.0]
 
 
-def bundle() -> rt.Rays:
+def bundle() -> rt.system.Rays:
     generator = torch.Generator().manual_seed(1)
     position = torch.cat([torch.rand(2, 50, generator=generator, dtype=torch.float64) * 4 - 2, torch.zeros(1, 50)])
     slope = torch.rand(2, 50, generator=generator, dtype=torch.float64) * 0.2 - 0.1
@@ -45,7 +45,7 @@ def bundle() -> rt.Rays:
 
 
 def test_breaks_that_undo_each_other_change_nothing():
-    ball = Surface(thickness=real(3.0), curvature=real(1 / 30), glass=rt.find_glass("N-BK7"))
+    ball = Surface(thickness=real(3.0), curvature=real(1 / 30), glass=rt.materials.find_glass("N-BK7"))
     image = Surface(thickness=real(0.0))
     back = {name: -number for name, number in SOME.items()}
     there = Surface(thickness=real(0.0), before=pose(**SOME), is_break=True)
@@ -59,7 +59,7 @@ def test_breaks_that_undo_each_other_change_nothing():
 
 
 def test_a_fold_by_breaks_is_a_fold_by_the_surface_tilts():
-    mirror = {"glass": rt.MIRROR, "thickness": real(0.0)}
+    mirror = {"glass": rt.materials.MIRROR, "thickness": real(0.0)}
     tilt, image = pose(tilt_x=45.0), Surface(thickness=real(0.0), curvature=real(0.01))
     by_breaks = [
         Surface(thickness=real(10.0)),
@@ -70,7 +70,7 @@ def test_a_fold_by_breaks_is_a_fold_by_the_surface_tilts():
     ]
     by_surface = [
         Surface(thickness=real(10.0)),
-        Surface(glass=rt.MIRROR, thickness=real(-20.0), before=tilt, after=tilt),
+        Surface(glass=rt.materials.MIRROR, thickness=real(-20.0), before=tilt, after=tilt),
         image,
     ]
     n = real(1.0)
@@ -122,7 +122,7 @@ def test_an_ideal_lens_images_points_to_points(sign):
 
 
 def test_a_surface_with_a_phase_needs_a_wavelength():
-    grating = Surface(thickness=real(0.0), phase=rt.Grating(real(0.5), real(1.0)))
+    grating = Surface(thickness=real(0.0), phase=rt.system.Grating(real(0.5), real(1.0)))
     with pytest.raises(ValueError, match="wavelength"):
         trace_surfaces([grating], bundle(), indices=[real(1.0)] * 2)
 
@@ -138,7 +138,7 @@ def test_derivatives_by_every_number_of_a_pose_and_a_grating():
             curvature=real(1 / 40),
             before=Pose(**dict(zip(names, numbers, strict=True))),
             after=Pose(**dict(zip(names, reversed(numbers), strict=True)), tilts_first=True),
-            phase=rt.Grating(frequency, real(1.0)),
+            phase=rt.system.Grating(frequency, real(1.0)),
         )
         end = trace_surfaces(
             [tilted, Surface(thickness=real(0.0))],

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from test_zemax_types import CASES, read, text
+from problems_zemax_types import CASES, read, text
 
 import raytrace as rt
 from raytrace.tracing.lens_report import entries, remarks
@@ -84,8 +84,8 @@ def test_a_typed_row_takes_the_numbers_of_its_poses():
     rows = [dict(radius=50, thickness=5, glass="N-BK7", **posed), dict(radius=-60, thickness=70)]
     lens = rt.lens(rows, stop=1, f_number=9, fields=[0, 2])
     number = partial(torch.tensor, dtype=torch.float64)
-    before = rt.Pose(x=number(0.2), y=number(-0.3), tilt_x=tilt, tilt_z=number(20.0), tilts_first=True)
-    after = rt.Pose(y=number(0.3), tilt_x=number(-1.5))
+    before = rt.system.Pose(x=number(0.2), y=number(-0.3), tilt_x=tilt, tilt_z=number(20.0), tilts_first=True)
+    after = rt.system.Pose(y=number(0.3), tilt_x=number(-1.5))
     plain = rt.lens(
         [{k: v for k, v in row.items() if k not in posed} for row in rows], stop=1, f_number=9, fields=[0, 2]
     )
@@ -101,9 +101,9 @@ def test_a_typed_row_takes_the_numbers_of_its_poses():
 
 def test_impossible_poses_of_a_typed_row_are_refused():
     row = dict(radius=50, thickness=5)
-    with pytest.raises(rt.BadPrescription, match=r"surface 1: both before and tilt_x are given; leave one out"):
-        rt.lens([row | dict(before=rt.Pose(), tilt_x=2)], stop=1, f_number=9)
-    with pytest.raises(rt.BadPrescription, match=r"surface 1 has no 'tiltx'; did you mean tilt_x\?"):
+    with pytest.raises(rt.BadPrescription, match=r"surface 1: .*before and tilt_x .*leave one out"):
+        rt.lens([row | dict(before=rt.system.Pose(), tilt_x=2)], stop=1, f_number=9)
+    with pytest.raises(rt.BadPrescription, match=r"surface 1 .*'tiltx'; did you mean tilt_x"):
         rt.lens([row | dict(tiltx=2)], stop=1, f_number=9)
     with pytest.raises(rt.BadPrescription, match="'steep' is not a number"):
         rt.lens([row | dict(tilt_x="steep")], stop=1, f_number=9)
@@ -112,7 +112,7 @@ def test_impossible_poses_of_a_typed_row_are_refused():
 def test_a_catalog_that_is_not_there_is_refused_by_its_name():
     """A list of catalogs that are not searched would take the glass from another one in silence."""
     rows = [dict(radius=50, thickness=5, glass="N-BK7"), dict(thickness=90)]
-    with pytest.raises(ValueError, match=r"catalogs: 'no such file' is no shipped catalog.*SCHOTT, OHARA"):
+    with pytest.raises(ValueError, match=r"catalogs: 'no such file'.*SCHOTT, OHARA"):
         rt.lens(rows, stop=1, entrance_pupil_diameter=10, catalogs=["SCHOTT", "no such file"])
     assert rt.lens(rows, stop=1, entrance_pupil_diameter=10, catalogs=["nikon"]).catalogs == ("nikon",)
 
@@ -130,7 +130,7 @@ def test_poses_of_the_object_other_than_tilts_are_refused():
     with pytest.raises(ValueError, match="surface 0: a tilted object at infinity"):
         rt.lens(rows, stop=1, entrance_pupil_diameter=10).replace(0, tilt_x=1)
     by_angle = rt.lens(rows, stop=1, entrance_pupil_diameter=10, object_distance=200, field_kind="angle", fields=[5])
-    with pytest.raises(ValueError, match=r"fields of the kind angle.*expected object heights"):
+    with pytest.raises(ValueError, match=r"angle.*expected object heights"):
         by_angle.replace(0, tilt_x=1)
     with pytest.raises(ValueError, match="surface 0 is tilted"):
         rt.seidel(near.replace(0, tilt_x=1))

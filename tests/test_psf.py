@@ -240,7 +240,7 @@ def test_auto_chooses_by_the_scene_and_gives_the_reason():
 
 def test_auto_stays_with_rays_where_waves_are_too_many():
     """A spectrum of 26 mm: its light lands where a window's waves turn a thousand times."""
-    with pytest.warns(NotConverged, match=r"drt: not compared with waves: the wave model needs \d+ pupil points"):
+    with pytest.warns(NotConverged, match=r"drt: not compared with waves: .*\d+ pupil points"):
         result = rt.psf(rt.read_lens("spectrometer"), "auto", tol=0.5, size=9)
     assert result.model == "drt"
     assert "not compared with waves" in result.reason
@@ -256,7 +256,7 @@ def test_number_of_rays_is_kept_to():
     assert few.rays <= 5
     with pytest.raises(ValueError, match="wave needs at least"):
         psf(slow(double_gauss()), Wave(rays=1), **options)
-    with pytest.raises(ValueError, match="gaussian needs at least 2 rays a kernel; 1 requested"):
+    with pytest.raises(ValueError, match=r"gaussian .*at least 2 rays .*1 requested"):
         psf(double_gauss(), Gaussian(rays=1), **options)
 
 
@@ -291,7 +291,7 @@ def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
 
 @pytest.mark.slow
 def test_an_unreachable_tolerance_is_reported():
-    with pytest.warns(NotConverged, match="gaussian: the estimated error .* stays above the tolerance 1e-11"):
+    with pytest.warns(NotConverged, match=r"gaussian: the estimated error .* 1e-11"):
         result = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
     assert float(result.error) > 1e-11
     assert "stays above" in result.reason
@@ -391,7 +391,7 @@ def test_a_kernel_without_light_has_no_place_and_no_width(model):
     assert whole == lit != 0
     with pytest.raises(EmptyPsf, match=r"1 of 2 PSFs, those of index \(0, 1\)"):
         psf(lens, model, fields=field(0, 85), execution=Execution(empty="error"), **work)
-    with pytest.raises(EmptyPsf, match="all 144 rays lost: 86 missed surface 1, 58 totally reflected at surface 2"):
+    with pytest.raises(EmptyPsf, match=r"144 rays .*86 missed surface 1, 58 .*surface 2"):
         psf(lens, model, fields=field(85), **work)
 
 

@@ -126,7 +126,7 @@ def test_a_window_off_the_light_has_almost_no_energy(model):
 
 
 def test_a_tolerance_below_rounding_is_reported():
-    with pytest.warns(NotConverged, match="wave: the estimated error .* stays above the tolerance 1e-09"):
+    with pytest.warns(NotConverged, match=r"wave: the estimated error .* 1e-09"):
         result = psf(slow(beam=3.0), "wave", fields=field(0.0), object_distances=number([25e3]), grid=grid(0.01, 3),
                     tol=1e-9)  # fmt: skip
     assert 1e-9 < float(result.error) < 1e-6

@@ -6,7 +6,7 @@ import pytest
 import torch
 from differences import gradcheck
 from problems import scalar, sharp_double_gauss, vector
-from test_psf_derivatives import moved
+from problems_psf import moved
 
 import raytrace as rt
 from raytrace.maths.sampling import grid
@@ -134,7 +134,7 @@ def test_a_window_on_the_axis_of_a_round_lens_is_a_constant():
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     lens = lens.replace(3, curvature=curvature)
     for center in ("chief", "centroid"):
-        centre = rt.psf(lens, rt.Gaussian(order=2), fields=[0], center=center).grid.centre
+        centre = rt.psf(lens, rt.psf_models.Gaussian(order=2), fields=[0], center=center).grid.centre
         assert not centre.requires_grad
         assert bool((centre == 0).all())
     view = scene(lens, vector(0.0, 0.0, 0.0, 3.0).reshape(2, 2), vector(1e4), vector(0.53))
@@ -156,5 +156,5 @@ def test_windows_of_a_lens_with_elements_follow_the_chief_ray():
 
 
 def test_a_window_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match="window 'moving' is not known; expected follows, fixed"):
+    with pytest.raises(ValueError, match=r"'moving' .*follows, fixed"):
         rt.psf(sharp_double_gauss(), "gaussian", window="moving")

@@ -44,9 +44,9 @@ def test_a_lens_prints_its_prescription_and_first_order_data(lens):
 
 
 def test_rays_are_launched_and_traced(lens):
-    rays = rt.rays(lens, fields=[0, 14], pupil=rt.gauss_rings(6))
+    rays = rt.tracing.rays(lens, fields=[0, 14], pupil=rt.maths.gauss_rings(6))
     end = rt.trace(lens, rays)
-    assert end.position.shape == (3, 2, 3, rt.gauss_rings(6)[0].shape[1])
+    assert end.position.shape == (3, 2, 3, rt.maths.gauss_rings(6)[0].shape[1])
     assert bool(end.valid[0].all())
     alone = rt.trace(lens)
     frame = alone.to_frame()
@@ -90,7 +90,7 @@ def test_a_focused_lens_is_a_lens(lens):
 
 def test_a_lens_learns_with_a_network(lens):
     module = rt.Variables(lens, "curvature:1-4 sensor")
-    camera = rt.Camera(module, rt.RedNet())
+    camera = rt.Camera(module, rt.imaging.RedNet())
     assert {name for name, _ in camera.named_parameters()} > {
         f"variables.{name}" for name, _ in module.named_parameters()
     }

@@ -105,9 +105,9 @@ def test_rays_serve_where_diffraction_is_no_matter(monkeypatch):
     assert found.geometric
     assert (both(found) - wave).abs().max() < 1e-3
     assert found.tangential.min() < 0.01
-    with pytest.raises(ValueError, match="more than 1280: focus the lens, or use geometric rays"):
+    with pytest.raises(ValueError, match="1280: focus the lens, or use geometric"):
         rt.mtf(lens, frequencies, geometric=False)
-    with pytest.raises(ValueError, match="more than 1280: focus the lens, or use geometric rays"):
+    with pytest.raises(ValueError, match="1280: focus the lens, or use geometric"):
         rt.mtf(mirror(8.0))
 
 
@@ -143,5 +143,5 @@ def test_text_json_and_figure_report_which_fields_are_geometric(rough, monkeypat
 
 def test_a_long_trace_is_predicted(rough, monkeypatch):
     monkeypatch.setattr(aperture, "_SURFACE_SECONDS", 1e-3)
-    with pytest.warns(TakesLong, match="needs a grid of [0-9,]+ rays: about .* minutes; for less, use geometric rays"):
+    with pytest.warns(TakesLong, match=r"[0-9,]+ rays: .*minutes; .*use geometric rays"):
         rt.mtf(rt.read_lens("double_gauss"), [5.0], fields=[0.0], geometric=False)

@@ -124,7 +124,7 @@ def test_rays_are_those_of_launch(cases, name):
 def test_derivatives_are_those_of_finite_differences(cases, name, engine):
     model, bundle = bundle_of(cases[name], name)
     x, count = model.start, len(model.start)
-    with rt.trace_engine(engine):
+    with rt.tracing.trace_engine(engine):
         hits = bundle.hits(model.views[0].state(Dual(x, np.eye(count))))
         for k in range(count):
             step = 1e-6 * max(abs(x[k]), 1e-3)

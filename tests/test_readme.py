@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.bench import trace
 from raytrace.cli import codesign_run, main
 
 ROOT = Path(__file__).parents[1]
@@ -82,12 +81,12 @@ def test_extras_that_the_readme_installs_exist():
 
 
 #: Examples and pages of seconds; by default the commands are only read, and run in the tests of their own.
-DEAR = ("compare double_gauss", "bench trace", "psf double_gauss --model drt", "api_analysis", "psf")
+DEAR = ("compare double_gauss", "psf double_gauss --model drt", "api_analysis", "psf")
 
 
 def quick_and_slow(listed: list, name) -> list:
     """Parameters of a test, those of DEAR in the slow suite."""
-    dear = [name(one) in DEAR or name(one).startswith(DEAR[:3]) for one in listed]
+    dear = [name(one) in DEAR or name(one).startswith(DEAR[:2]) for one in listed]
     return [pytest.param(one, marks=pytest.mark.slow if slow else ()) for one, slow in zip(listed, dear, strict=True)]
 
 
@@ -96,16 +95,11 @@ def test_examples_run(line, tmp_path, monkeypatch, capsys):
     (tmp_path / "lenses").symlink_to(ROOT / "lenses")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(codesign_run, "_LEAVES", 16)  # pictures: a hundred take 8 s to draw
-    monkeypatch.setattr(trace, "SAMPLE", 6)
     assert main(shlex.split(line)) == 0, capsys.readouterr().err
     words = shlex.split(line)
     for option in ("-o", "--plot"):
         if option in words:
             assert Path(words[words.index(option) + 1]).stat().st_size > 0
-
-
-def test_readme_is_one_screen():
-    assert len(README.split()) <= 900
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -332,5 +332,5 @@ def test_colours_of_16_bits_and_wrong_channels(tmp_path):
     with pytest.raises(PictureError, match="1 or 3 channels, not 2"):
         read_levels(tmp_path / "a.png", 2)
     Image.fromarray(np.full((2, 2), 70000, np.int32)).save(tmp_path / "b.tif")
-    with pytest.raises(PictureError, match="levels from 70000 to 70000; expected 8 or 16 bits"):
+    with pytest.raises(PictureError, match="70000; expected 8 or 16 bits"):
         read_levels(tmp_path / "b.tif")

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from test_render import random
+from problems import random
 
 import raytrace as rt
 from raytrace.imaging.render import optics, patch_kernels, render_patches

@@ -285,12 +285,12 @@ def test_margins_and_psnr():
     torch.testing.assert_close(found, torch.full((3,), 20.0, dtype=torch.float64))
     assert float(psnr(torch.tensor(1.0), peak=255.0)) == pytest.approx(48.1308, abs=1e-4)
     assert float(psnr(torch.tensor(0.0))) == math.inf
-    with pytest.raises(ValueError, match="a margin of 5 rows and 5 columns of 10 × 12 pixels: nothing is left"):
+    with pytest.raises(ValueError, match="5 rows and 5 columns of 10 × 12 pixels: nothing"):
         within(estimate, 5)
 
 
 def test_mismatched_shapes_are_refused():
-    with pytest.raises(ValueError, match="'circular', an image of 8 × 8 pixels, a filter of 12 × 12: expected equal"):
+    with pytest.raises(ValueError, match=r"8 × 8 pixels, .* 12 × 12: expected equal"):
         restore(torch.zeros(8, 8), torch.zeros(12, 12))
     with pytest.raises(ValueError, match="boundary 'valid'"):
         restore(torch.zeros(8, 8), torch.zeros(8, 8), boundary="valid")
@@ -549,13 +549,11 @@ def test_joint_filters_of_extended_images():
 def test_other_channels_are_refused():
     H, S = transfer_functions(blurs(1, 3, 3, 3), 8), correlated(0.5, power_law(8))
     for call in (joint_wiener, joint_error, joint_errors):
-        with pytest.raises(
-            ValueError, match=r"a cross spectrum of shape \(8, 8\).*expected \(..., C, C, rows, columns\)"
-        ):
+        with pytest.raises(ValueError, match=r"cross spectrum .*\(8, 8\).*\(..., C, C, rows, columns\)"):
             call(H, S[0, 0], 0.1)
-    with pytest.raises(ValueError, match=r"\(2, 2, 8, 8\) and transfer functions or kernels of shape \(1, 3, 8, 8\)"):
+    with pytest.raises(ValueError, match=r"\(2, 2, 8, 8\) .*kernels .*\(1, 3, 8, 8\)"):
         joint_kernel_error(blurs(1, 3, 8, 8), S[:2, :2], 0.1)
     with pytest.raises(ValueError, match=r"expected \(B, ..., channels, rows, columns\)"):
         cross_spectrum(torch.rand(3, 8, 8))
-    with pytest.raises(ValueError, match=r"image of shape \(8, 8\) and a filter of shape \(3, 3, 8, 8\): expected"):
+    with pytest.raises(ValueError, match=r"\(8, 8\) .*filter .*\(3, 3, 8, 8\): expected"):
         restore_jointly(torch.rand(8, 8), joint_wiener(H, S, 0.1))

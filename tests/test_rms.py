@@ -61,7 +61,7 @@ def test_fields_without_light_are_nan_and_words_that_are_none_are_refused():
     system = lens([surface(0.01, 60.0, 1.5), blind], field=fields("angle", (0.0, 20.0)))
     found = rms_over_field(system, samples=2)
     assert found.polychromatic.isnan().tolist() == [False, True]
-    with pytest.raises(ValueError, match="reference 'chief': expected one of primary, own"):
+    with pytest.raises(ValueError, match=r"'chief': expected .*primary, own"):
         rms_over_field(system, reference="chief")
 
 

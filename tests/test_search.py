@@ -34,7 +34,10 @@ from raytrace.optimization.variables import DesignVariables, bounds_of, design_v
 
 PLANE = float("inf")
 PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem
-HOW = {"merit": rt.DefaultMerit("spot", glass_thickness="2:8", edge=1.0, rings=2), "vary": "curvature thickness"}
+HOW = {
+    "merit": rt.optimization.DefaultMerit("spot", glass_thickness="2:8", edge=1.0, rings=2),
+    "vary": "curvature thickness",
+}
 
 
 def plates(*glasses, diameter=10.0, fields=(0.0, 7.0)):
@@ -71,7 +74,7 @@ def test_starts_have_the_focal_length_and_the_sensor_at_the_paraxial_focus(glass
         length = float(rt.first_order(made).effective_focal_length)
         if length == pytest.approx(50, rel=1e-6):
             brought += 1
-            distance = float(rt.paraxial_image_distance(made, np.inf))
+            distance = float(rt.tracing.paraxial_image_distance(made, np.inf))
             assert float(made.surfaces[-2].thickness) == pytest.approx(np.clip(distance, 1, 500), rel=1e-9)
     assert brought >= 12  # steep ones of other signs have no such scale within their bounds
 
@@ -112,7 +115,7 @@ def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():
     model, own = DesignVariables(lens), float(rt.first_order(lens).effective_focal_length)
     rows = DefaultMerit().rows(lens)
     assert length_of(model, rows, 1.0, ()) == pytest.approx(own)
-    aimed = (*rows, rt.Row("EFFL", target=3.0, weight=1.0))
+    aimed = (*rows, rt.system.Row("EFFL", target=3.0, weight=1.0))
     assert length_of(model, aimed, 25.4, ()) == pytest.approx(76.2)
     assert length_of(model, aimed, 1.0, conditions_of(lens, "efl=70")) == 70
 
@@ -188,8 +191,8 @@ def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
     free = design_variables(lens, "curvature thickness:2,4 sensor curvature:6=-curvature:1")
     rows = (
         *DefaultMerit().rows(lens),
-        rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1),
-        rt.Row("MNEG", (1, 6)),
+        rt.system.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1),
+        rt.system.Row("MNEG", (1, 6)),
     )
     asked = SearchProblem(
         free, rows, conditions_of(lens, "bfd>=40"), bounds_of(free.lens, free.variables), None, None, PLAIN
@@ -210,7 +213,11 @@ def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
 
 
 def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
-    rows = rt.Row("MNEG", (1, 6), target=2.0, weight=1), rt.Row("MXCG", (1, 6), target=9.0, weight=1), rt.Row("EFFL")
+    rows = (
+        rt.system.Row("MNEG", (1, 6), target=2.0, weight=1),
+        rt.system.Row("MXCG", (1, 6), target=9.0, weight=1),
+        rt.system.Row("EFFL"),
+    )
     numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
     others = [("MXCG", (1, 6), 9.0), ("EFFL", (0, 0), 0.0)]
     assert numbers(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
@@ -282,13 +289,13 @@ def test_from_a_singlet_to_better_lenses_of_two_elements(found, tmp_path):
 
 def edge_of(lens, k):
     """Thickness of the glass behind surface k where the widest beam of all goes through it."""
-    row = rt.Row("ETVA", (k, 0), weight=1.0)
+    row = rt.system.Row("ETVA", (k, 0), weight=1.0)
     return float(rt.evaluate(lens, merit=[row]).values[0])
 
 
 @pytest.mark.slow
 def test_from_a_triplet_to_better_lenses_of_four_elements():
-    merit = rt.DefaultMerit("spot", glass_thickness="2:12", air_thickness="0.5:40", edge=1.0)
+    merit = rt.optimization.DefaultMerit("spot", glass_thickness="2:12", air_thickness="0.5:40", edge=1.0)
     how = {"merit": merit, "vary": "curvature thickness", "hold": "efl=100"}
     triplet = rt.read_lens("cooke_triplet")
     three = rt.optimize(triplet, cycles=200, **how)
@@ -336,7 +343,7 @@ def test_a_resumed_search_ends_as_an_uninterrupted_one(plate, found, tmp_path):
 
         set_postfix_str = close = lambda self, *arguments: None
 
-    with pytest.raises(NoProblem, match=r"from 0 starts; the nearest of 4 descents, in .*nearest.zmx: ") as error:
+    with pytest.raises(NoProblem, match=r"0 starts; .* 4 descents, .*nearest.zmx") as error:
         rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, progress=Bar, **HOW)
     assert "it is not at its minimum yet" in str(error.value) or "efl=50 at " in str(error.value)
     nearest = rt.read_lens(tmp_path / "nearest.zmx")
@@ -438,7 +445,7 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
     free = design_variables(plate, "curvature sensor")
     model = DesignVariables(free.lens, free.variables)
     for name in ("EFFL", "ISFN"):
-        found = Evaluation(model, [rt.Row(name, (0, 1) if name == "EFFL" else (0, 0), weight=1.0)])(
+        found = Evaluation(model, [rt.system.Row(name, (0, 1) if name == "EFFL" else (0, 0), weight=1.0)])(
             model.start, derivatives=True
         )
         assert np.isinf(found.values).all()
@@ -450,9 +457,7 @@ def test_plane_plates_have_no_focal_length_and_no_warning():
 @pytest.mark.slow
 def test_a_search_without_a_lens_names_what_its_nearest_one_misses(plate):
     """F/5 is not F/3, which no linear model of one point excludes."""
-    with pytest.raises(
-        NoProblem, match=r"from 2 starts; the nearest of \d+ descents: .*working_f_number=3 at"
-    ) as error:
+    with pytest.raises(NoProblem, match=r"2 starts; .*working_f_number=3") as error:
         rt.search(plate, hold="efl=50 working_f_number=3", starts=2, **HOW)
     assert "hold less" in str(error.value)
 
@@ -465,7 +470,7 @@ def test_a_triplet_from_plates_with_two_limits_and_real_aiming():
     colours = {"wavelengths": [0.4861327, 0.5875618, 0.6562725], "primary_wavelength": 2, "catalogs": ["schott"]}
     plates = rt.lens(rows, stop=5, entrance_pupil_diameter=12.5, fields=[0, 14, 20], **colours)
     plates = dataclasses.replace(plates, ray_aiming="real")
-    merit = rt.DefaultMerit("spot", glass_thickness=(1.5, 8), air_thickness=(0.5, 12), edge=1)
+    merit = rt.optimization.DefaultMerit("spot", glass_thickness=(1.5, 8), air_thickness=(0.5, 12), edge=1)
     hold = "efl=50 bfd>=35 distortion<=2%"
     found = rt.search(plates, merit=merit, vary="curvature thickness", hold=hold, starts=1)
     for lens in found.lenses:

@@ -63,20 +63,15 @@ def test_means_without_limits_are_exact_and_those_within_are_of_many_draws():
         assert float(negative) == 0
 
 
-@pytest.fixture(scope="module")
-def triplet():
-    return rt.focus("cooke_triplet").lens
-
-
 def held(lens, limits):
-    return rt.tolerances(lens, limits, compensators=[rt.Compensator(7, minimum=-0.1, maximum=0.1)])
+    return rt.tolerances(lens, limits, compensators=[rt.system.Compensator(7, minimum=-0.1, maximum=0.1)])
 
 
 @pytest.mark.slow
-def test_expectation_within_limits_of_the_sensor_is_the_mean_of_the_trials(triplet):
-    rows = held(triplet, "radius=0.1% air=0.05 element_decenter=0.05")
-    found = rt.tolerance(triplet, rows, trials=400, seed=7)
-    free = rt.tolerance(triplet, dataclasses.replace(rows, compensators=(rt.Compensator(7),)), trials=0)
+def test_expectation_within_limits_of_the_sensor_is_the_mean_of_the_trials(focused_triplet):
+    rows = held(focused_triplet, "radius=0.1% air=0.05 element_decenter=0.05")
+    found = rt.tolerance(focused_triplet, rows, trials=400, seed=7)
+    free = rt.tolerance(focused_triplet, dataclasses.replace(rows, compensators=(rt.system.Compensator(7),)), trials=0)
     assert found.at_limit(0) > 100
     assert float(found.expected) > 1.05 * float(free.expected)  # limits that the expectation feels
     error = float(found.trials.std()) / len(found.trials) ** 0.5
@@ -85,17 +80,19 @@ def test_expectation_within_limits_of_the_sensor_is_the_mean_of_the_trials(tripl
 
 
 @pytest.mark.slow
-def test_a_yield_within_limits_of_the_sensor_is_that_of_unseen_trials(triplet):
-    rows = rt.tolerances(triplet, grade="precision", compensators=held(triplet, "radius=1%").compensators)
-    tight = rt.tolerance(triplet, rows, trials=0, goal=24.0, yield_=0.9)
-    unseen = rt.tolerance(triplet, tight.tolerances, trials=2000, seed=77, goal=24.0)
+def test_a_yield_within_limits_of_the_sensor_is_that_of_unseen_trials(focused_triplet):
+    rows = rt.tolerances(
+        focused_triplet, grade="precision", compensators=held(focused_triplet, "radius=1%").compensators
+    )
+    tight = rt.tolerance(focused_triplet, rows, trials=0, goal=24.0, yield_=0.9)
+    unseen = rt.tolerance(focused_triplet, tight.tolerances, trials=2000, seed=77, goal=24.0)
     assert unseen.yield_at(24.0) == pytest.approx(0.9, abs=3 * (0.9 * 0.1 / 2000) ** 0.5)
     assert unseen.summary()["yield_by_second_order"] == pytest.approx(0.9, abs=0.01)
 
 
-def test_a_model_that_does_not_hold_says_so(triplet):
+def test_a_model_that_does_not_hold_says_so(focused_triplet):
     """Decentres far beyond second order."""
-    found = rt.tolerance(triplet, held(triplet, "element_decenter:3=6"), trials=64)
+    found = rt.tolerance(focused_triplet, held(focused_triplet, "element_decenter:3=6"), trials=64)
     assert found.holds
     assert not found.summary()["second_order_holds"]
     assert "the second order does not hold" in str(found)

@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 from differences import gradcheck
-from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
+from merit_cases import FIELD, SYSTEMS
+from problems import fields, lens, scalar, surface, vector
 
 from raytrace import seidel
 from raytrace.io import read_lens
@@ -24,41 +25,6 @@ from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_
 from raytrace.tracing.spot import image_rays
 
 INF = math.inf
-FIELD = fields("angle", (8.0,))
-
-
-def cassegrain() -> Lens:
-    primary = surface(-1 / 200, -70.0, MIRROR, conic=-1.0)
-    secondary = surface(-0.0267, 150.0, MIRROR, conic=-2.25)
-    return lens([surface(None, 30.0), primary, secondary], aperture=("entrance_pupil_diameter", 20.0), field=FIELD)
-
-
-def behind_a_stop(*surfaces, **others) -> Lens:
-    return lens([surface(None, 7.0), *surfaces], field=FIELD, **others)
-
-
-SYSTEMS = {
-    "thick lens": behind_a_stop(surface(0.02, 5.0, 1.5), surface(-0.01, 95.0)),
-    "double Gauss": double_gauss(field=FIELD),
-    "asphere with an r² term": dataclasses.replace(aspheric_singlet(field=FIELD), stop=2),
-    "asphere behind a stop": behind_a_stop(
-        surface(0.02, 5.0, 1.5, conic=-2.0, coefficients=[1e-3, 2e-5]), surface(None, 95.0, coefficients=[0.0, 1e-5])
-    ),
-    "concave mirror": behind_a_stop(surface(-0.01, -50.0, MIRROR)),
-    "two aspheric mirrors": cassegrain(),
-    "Mangin": behind_a_stop(surface(-0.01, 5.0, 1.5), surface(-0.012, -5.0, MIRROR), surface(-0.01, -40.0)),
-    "immersed image": behind_a_stop(surface(0.05, 60.0, 1.5)),
-    "immersed object": behind_a_stop(surface(-0.03, 80.0)),
-}
-
-
-def immersed(system: Lens) -> Lens:
-    """The object and the stop in water."""
-    water = surface(None, 0.0, 1.33).glass
-    return system.replace(0, glass=water).replace(1, glass=water)
-
-
-SYSTEMS["immersed object"] = immersed(SYSTEMS["immersed object"])
 
 
 def in_paraxial_focus(system: Lens, distance: float) -> Lens:

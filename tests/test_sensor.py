@@ -35,7 +35,7 @@ def grid_of(one: rt.Sensor, count: int = 4) -> torch.Tensor:
 def with_kind(lens: rt.Lens, kind: str) -> rt.Lens:
     """The lens on the axis alone, with another kind of field, without vignetting factors."""
     zero = torch.zeros_like(lens.fields.y[:1])
-    return dataclasses.replace(lens, fields=rt.Fields(kind, zero, zero, zero + 1))
+    return dataclasses.replace(lens, fields=rt.system.Fields(kind, zero, zero, zero + 1))
 
 
 # -- pixels
@@ -122,7 +122,7 @@ def test_points_without_a_chief_ray_are_nan_and_leave_the_others():
 
 def test_a_batch_of_lenses_has_fields_of_each():
     lens = rt.read_lens("double_gauss")
-    both = rt.batch([lens, lens.at(sensor_distance=57.0)])
+    both = rt.system.batch([lens, lens.at(sensor_distance=57.0)])
     points = grid_of(rt.Sensor((24.0, 16.0), (600, 400)), 3)
     fields = sensor().fields(both, points)
     assert fields.shape == (2, 2, 3, 3)

@@ -5,12 +5,11 @@ import dataclasses
 import json
 import math
 from decimal import Decimal, localcontext
-from pathlib import Path
 
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
-from problems import both_engines, field, lens, scalar, scene_of, surface, vector
+from problems import SHARED, both_engines, field, lens, scalar, scene_of, surface, vector
 from torch.testing import assert_close
 
 import raytrace as rt
@@ -37,7 +36,6 @@ from raytrace.tracing.spot import spot_of
 from raytrace.tracing.streaming import stream_spot
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
-SHARED = Path(__file__).parents[2] / "shared"
 TIER2, CORPUS = SHARED / "tier2", SHARED / "corpus"
 ODD = "odd asphere"
 CURVATURE, CONIC = 0.02, -0.6
@@ -171,7 +169,7 @@ def test_the_tip_of_a_cone_makes_no_nan(engine, dtype):
     assert float(end.direction[1, 3]) == pytest.approx(math.sin(bent), rel=1e-6)
 
 
-@pytest.mark.skipif(not TIER2.exists(), reason="needs ../shared/tier2")
+@pytest.mark.needs(TIER2)
 def test_a_file_of_another_hand_is_traced_as_its_oracle_says():
     found = read_lens(TIER2 / "dev" / "oddasphe.zmx")
     oracle = json.loads((TIER2 / "oracle_dev.json").read_text())["files"]["oddasphe.zmx"]
@@ -204,7 +202,7 @@ def test_units_and_too_many_terms(tmp_path):
     face = read_lens(path).surfaces[1]
     assert face.kind == ODD
     assert_close(face.coefficients, vector(0.1, 0.0, 0.2 / 25.4**2), rtol=1e-15, atol=0)
-    with pytest.raises(LensFileError, match=r"9 terms \(to r\^9\), an ODDASPHE has 8 \(r to r\^8\)"):
+    with pytest.raises(LensFileError, match=r"9 terms .*ODDASPHE has 8"):
         write_lens(lens([odd([1e-9] * 9), surface(None, 2.0)]), tmp_path / "odd.zmx")
 
 
@@ -344,7 +342,7 @@ class TestWhatHasToKnow:
             assert torch.equal(sag_at(found, x, x), sag_at(face, x, x))
         with pytest.raises(
             ValueError,
-            match="surface 1: kind 'cone'; expected one of even asphere, odd asphere, toroidal, biconic, dome",
+            match=r"surface 1: .*'cone'; expected .*even asphere, .*biconic, dome",
         ):
             plain.replace(1, kind="cone")
 
@@ -451,7 +449,7 @@ def test_a_scene_with_a_polygon_has_no_symmetry_and_a_figure(tmp_path):
     assert float(found.energy) == pytest.approx(share, rel=3e-2)
 
 
-@pytest.mark.skipif(not SLIT.exists(), reason="needs ../shared/corpus")
+@pytest.mark.needs(CORPUS)
 def test_slits_of_a_real_file():
     """Six bars of 1 × 12 mm, one every 2 mm, as user-defined aperture that is shifted by half a bar."""
     (aperture,) = read_lens(SLIT).surfaces[1].apertures
@@ -465,7 +463,7 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
     """A diamond |x|/a + |y|/b ≤ 1: traced, drawn, in kernels and in files; refused where it is unknown."""
     diamond = Aperture("diamond", (4.0, 3.0))
     system = lens([surface(0.02, 5.0, 1.5, apertures=(diamond,), semi_diameter=9.0), surface(-0.02, 60.0)])
-    with pytest.raises(ValueError, match="surface 1: an aperture of shape 'diamond'; expected one of circular, rect"):
+    with pytest.raises(ValueError, match=r"surface 1: .*'diamond'; expected .*circular, rect"):
         system.at(object_distance=1e4)
     row = Shape(
         lambda x, y, sizes: [Edge(x.abs() / sizes[0] + y.abs() / sizes[1], 1.0)],
@@ -489,5 +487,5 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
         write_lens(system, tmp_path / f"diamond{suffix}")
         (back,) = read_lens(tmp_path / f"diamond{suffix}").surfaces[1].apertures
         assert (back.shape, back.extent, back.obscures) == ("diamond", (4.0, 3.0), False)
-    with pytest.raises(ValueError, match=r"surface 1: an aperture \(diamond\) has a negative size"):
+    with pytest.raises(ValueError, match=r"surface 1: .*diamond.*negative size"):
         system.replace(1, apertures=(Aperture("diamond", (4.0, -3.0)),))

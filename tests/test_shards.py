@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_training import fit
+from problems_training import fit
 
 import raytrace as rt
 from raytrace import shards
@@ -53,8 +53,8 @@ CLIPPED = ("clipped fields",)
 
 def lens() -> Lens:
     """The double Gauss, in focus at 25 m."""
-    found = rt.with_object_distance(rt.read_lens(shipped("lenses") / "double_gauss.zmx"), 25000.0)
-    return rt.with_sensor_distance(found, FOCUS)
+    found = rt.system.with_object_distance(rt.read_lens(shipped("lenses") / "double_gauss.zmx"), 25000.0)
+    return rt.system.with_sensor_distance(found, FOCUS)
 
 
 def kernels(of: Lens, case: dict) -> dict[str, np.ndarray]:
@@ -259,7 +259,7 @@ def test_moments_of_parts_are_those_of_all_light():
 def test_shared_kernels_have_no_gradient():
     of = lens()
     sensor = of.surfaces[-2].thickness.clone().requires_grad_()
-    of = rt.with_sensor_distance(of, sensor)
+    of = rt.system.with_sensor_distance(of, sensor)
     with pytest.raises(ValueError, match="no gradient: leave share out"):
         psf(of, Gaussian(order=3), execution=Execution(share=Share(0, 2)))
     with pytest.raises(ValueError, match="one rho and one zernike"):

@@ -38,8 +38,7 @@ def test_a_public_verb_has_type_hints(name):
 def test_every_file_of_oracles_is_described_and_every_described_file_is_there():
     there = {path.name for path in ORACLES.iterdir() if path.is_file()} - {"README.md"}
     assert there == set(DESCRIBED)
-    for name, description in DESCRIBED.items():
-        assert len(description.split()) > 5, name
+    for description in DESCRIBED.values():
         for generator in re.findall(r"`(\w+\.py)`", description):
             assert (ORACLES / generator).is_file(), generator
 

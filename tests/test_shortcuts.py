@@ -7,10 +7,10 @@ from functools import partial
 
 import pytest
 import torch
+from scripts import script
 from torch import Tensor
 
 from raytrace.bench.measure import field_rays, with_leaves
-from raytrace.bench.speed import slope, with_sensor_leaf
 from raytrace.io import read_lens
 from raytrace.maths.sampling import grid, sobol
 from raytrace.psf_models import MODELS, fourier, model_of, psf
@@ -20,6 +20,9 @@ from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.scene import Memo, scene, symmetry, trace_bundle
 from raytrace.tracing.trace import trace_lens
+
+ratios = script("bench_ratios")
+slope, with_sensor_leaf = ratios.slope, ratios.with_sensor_leaf
 
 SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it
 FIELD = 10.0  # degrees

@@ -29,7 +29,7 @@ def of_gaussian(frequencies, sigma):
 @pytest.mark.parametrize("angle", [3.0, 5.0, 8.0, -5.0, 20.0])
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
 def test_a_gaussian_is_measured_up_to_a_cycle_a_pixel(angle, sigma):
-    found = rt.slanted_edge_mtf(edge(angle, sigma), PITCH)
+    found = rt.imaging.slanted_edge_mtf(edge(angle, sigma), PITCH)
     assert found.across == "x"
     assert found.angle == pytest.approx(angle, abs=5e-3)
     torch.testing.assert_close(found.mtf, of_gaussian(found.frequencies, sigma), rtol=0, atol=2e-3)
@@ -38,9 +38,9 @@ def test_a_gaussian_is_measured_up_to_a_cycle_a_pixel(angle, sigma):
 
 
 def test_an_edge_along_the_rows_and_a_falling_one():
-    upright = rt.slanted_edge_mtf(edge(5.0, 1.0), PITCH)
-    lying = rt.slanted_edge_mtf(edge(5.0, 1.0).T, PITCH)
-    falling = rt.slanted_edge_mtf(1 - edge(5.0, 1.0), PITCH)
+    upright = rt.imaging.slanted_edge_mtf(edge(5.0, 1.0), PITCH)
+    lying = rt.imaging.slanted_edge_mtf(edge(5.0, 1.0).T, PITCH)
+    falling = rt.imaging.slanted_edge_mtf(1 - edge(5.0, 1.0), PITCH)
     assert lying.across == "y"
     torch.testing.assert_close(lying.mtf, upright.mtf, rtol=0, atol=1e-12)
     torch.testing.assert_close(falling.mtf, upright.mtf, rtol=0, atol=1e-9)
@@ -50,7 +50,7 @@ def test_noise_of_one_percent_leaves_the_mtf():
     """A mean of 25 edges: each has noise of its own, which has no bias at half of the Nyquist frequency."""
     generator = torch.Generator().manual_seed(0)
     pictures = [edge(5.0, 1.0) + 0.006 * torch.randn(ROWS, COLUMNS, generator=generator).double() for _ in range(25)]
-    found = [rt.slanted_edge_mtf(picture, PITCH) for picture in pictures]
+    found = [rt.imaging.slanted_edge_mtf(picture, PITCH) for picture in pictures]
     assert max(abs(one.angle - 5.0) for one in found) < 0.1
     quarter = 0.25 / PITCH
     mean = torch.stack([one.at(quarter) for one in found]).mean()
@@ -61,10 +61,12 @@ def test_sixteen_bits_are_decoded_and_floats_are_light():
     light = edge(5.0, 1.0)
     encoded = torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     levels = np.round(65535 * encoded.numpy()).astype(np.uint16)
-    found, wanted = rt.slanted_edge_mtf(levels, PITCH), rt.slanted_edge_mtf(light, PITCH)
+    found, wanted = rt.imaging.slanted_edge_mtf(levels, PITCH), rt.imaging.slanted_edge_mtf(light, PITCH)
     frequencies = torch.linspace(0, 0.5 / PITCH, 9)
     torch.testing.assert_close(found.at(frequencies), wanted.at(frequencies), rtol=0, atol=2e-3)
-    assert float((rt.slanted_edge_mtf(encoded, PITCH).at(frequencies) - wanted.at(frequencies)).abs().max()) > 5e-3
+    assert (
+        float((rt.imaging.slanted_edge_mtf(encoded, PITCH).at(frequencies) - wanted.at(frequencies)).abs().max()) > 5e-3
+    )
 
 
 def test_the_derivative_by_the_picture():
@@ -74,7 +76,7 @@ def test_the_derivative_by_the_picture():
     direction -= direction.mean()
 
     def modulation(size):
-        return rt.slanted_edge_mtf(picture + size * direction, PITCH).mtf[8]
+        return rt.imaging.slanted_edge_mtf(picture + size * direction, PITCH).mtf[8]
 
     size = torch.zeros((), dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(modulation(size), size)
@@ -101,16 +103,16 @@ def test_the_derivative_by_the_picture():
 )
 def test_bad_pictures_are_one_clear_error(picture, message):
     with pytest.raises(ValueError, match=message):
-        rt.slanted_edge_mtf(picture, PITCH)
+        rt.imaging.slanted_edge_mtf(picture, PITCH)
 
 
 def test_a_bad_pitch_is_an_error():
     with pytest.raises(ValueError, match=r"pitch 0.*in mm, above 0"):
-        rt.slanted_edge_mtf(edge(5.0, 1.0), 0)
+        rt.imaging.slanted_edge_mtf(edge(5.0, 1.0), 0)
 
 
 def test_table_document_and_figure(tmp_path):
-    found = rt.slanted_edge_mtf(edge(5.0, 1.0), PITCH)
+    found = rt.imaging.slanted_edge_mtf(edge(5.0, 1.0), PITCH)
     assert "edge 5.00° from the columns, MTF50 46.86 cycles/mm" in str(found)
     assert list(found.to_frame().columns) == ["frequency", "mtf"]
     found.save(tmp_path / "edge.json")
@@ -142,7 +144,7 @@ def rendered(lens, model, height, across, *, pitch, fine, half=30, reach=16, ang
 
 def across_edge(lens, fields, frequencies, across, angle):
     """Modulation (K,) by rays of one field along the normal of an edge, at an angle in degrees from x or y."""
-    points, weights = rt.gauss_rings(40, 160)
+    points, weights = rt.maths.gauss_rings(40, 160)
     rays = image_rays(lens, points, fields=fields)
     shares = (weights * rays.valid[0]) * lens.wavelength_weights[:, None]
     x, y = (part[0] for part in rays.position[:2])
@@ -177,7 +179,7 @@ def test_the_rendered_edge_has_the_mtf_of_the_lens_and_of_a_pixel(name, model, h
     """
     lens, pitch = rt.focus(rt.read_lens(name)).lens, 0.006
     picture, fields = rendered(lens, model, height, across, pitch=pitch, fine=fine)
-    found = rt.slanted_edge_mtf(picture, pitch)
+    found = rt.imaging.slanted_edge_mtf(picture, pitch)
     assert found.across == across
     below = found.frequencies <= (0.5 if fine == 4 else 0.25) / pitch
     frequencies = found.frequencies[below]

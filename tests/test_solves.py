@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
-from problems import focal_length
-from test_corpus import CORPUS
-from test_operands_boundaries import semi_diameters
+from problems import SHARED, focal_length, semi_diameters
 
 import raytrace as rt
 from raytrace.materials.glass import model_glass, refractive_index
@@ -25,6 +23,7 @@ from raytrace.system.surface import sag
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.trace import trace_lens
 
+CORPUS = SHARED / "corpus"
 VARY = Vary(1, "curvature"), Vary(3, "thickness"), Vary(5, "curvature")
 
 #: Rules of the double Gauss, whose stop is surface 6, each with what it must come to.
@@ -272,6 +271,7 @@ def test_numbers_changed_by_an_operand_are_named_once():
     assert design_variables(lens, "thickness:3").solves == ()
 
 
+@pytest.mark.needs(CORPUS)
 @pytest.mark.parametrize(
     ("path", "kind", "near"),
     [
@@ -281,8 +281,6 @@ def test_numbers_changed_by_an_operand_are_named_once():
 )
 def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
     """5.0376… mm at an edge in inches, 42.3517… mm by the real ray through 0.7 of the pupil; paraxially 41.6005."""
-    if not (CORPUS / "zmx" / path).exists():
-        pytest.skip("the files are in ../shared")
     lens = rt.read_lens(CORPUS / "zmx" / path)
     (solve,) = (one for one in lens.optimization_data.solves if one.kind == kind)
     found = DesignVariables(lens, (), (solve,)).views[0].state(np.zeros(0)).numbers[solve.surface, "thickness"]

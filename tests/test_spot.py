@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from differences import gradcheck, gradgradcheck
+from hardcases_scene import of_kind
 from problems import floats, number, vector
-from test_hardcases import of_kind
 
 import raytrace as rt
 from raytrace.cli import main
@@ -222,22 +222,22 @@ def test_spots_of_a_batch_are_those_of_its_lenses():
     """Irregular surfaces, some lenses clipped; and a batch of none."""
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="off", fields=[0], wavelengths=[0.5876])
     radius = 0.5 * float(rt.first_order(lens).entrance_pupil_diameter) + 0.3
-    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, radius)),))
+    lens = lens.replace(1, apertures=(rt.system.Aperture("circular", (0.0, radius)),))
     rows = rt.tolerances(lens, "irregularity:3=0.5 element_decenter:1=1", compensators=[])
-    errors = rt.draw_errors(rows, 3, seed=1)
+    errors = rt.tolerancing.draw_errors(rows, 3, seed=1)
     errors[0, -2:] = 0
-    lenses = rt.perturbed(lens, rows, errors)
+    lenses = rt.tolerancing.perturbed(lens, rows, errors)
     for reference in ("centroid", "chief"):
         several = rt.spot(lenses, rings=4, reference=reference)
         clipped = (several.rays < several.launched).flatten(1).any(-1)
         for k in range(3):
-            alone = rt.spot(rt.perturbed(lens, rows, errors[k]), rings=4, reference=reference)
+            alone = rt.spot(rt.tolerancing.perturbed(lens, rows, errors[k]), rings=4, reference=reference)
             for name in ("rms_radius", "geometric_radius", "rays"):
                 torch.testing.assert_close(getattr(several, name)[k], getattr(alone, name), rtol=1e-10, atol=0)
             torch.testing.assert_close(several.whole.rms_radius[k], alone.whole.rms_radius, rtol=1e-10, atol=0)
     assert bool(clipped.any())
     assert not bool(clipped.all())
-    assert rt.spot(rt.perturbed(lens, rows, torch.zeros(0, len(rows)))).rms_radius.shape == (0, 1, 1)
+    assert rt.spot(rt.tolerancing.perturbed(lens, rows, torch.zeros(0, len(rows)))).rms_radius.shape == (0, 1, 1)
 
 
 @pytest.mark.parametrize("rings", [2, 3])

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from problems_stores import STRANGE, put
+from scripts import script
 
 from raytrace import stores
-from raytrace.experiments import Store
 from raytrace.files import append_text
 from raytrace.imaging.codesign import Outcome
 from raytrace.imaging.training import DamagedRun, OtherSettings, Run
@@ -40,28 +41,7 @@ from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.element_files import read_label, write_element
 from raytrace.wave_optics.height_maps import HeightMapError
 
-#: What JSON can hold that no store expects, as it is written.
-STRANGE = {
-    "list": "[1]",
-    "null": "null",
-    "text": '"low"',
-    "truth": "true",
-    "nothing": "",
-    "names": "{}",
-    "400 digits": "9" * 400,
-    "5000 digits": "9" * 5000,
-    "not a number": "NaN",
-    "infinity": "-Infinity",
-    "depth": "[" * 200_000,
-    "deep names": '{"a":' * 200_000,
-    "torn": '{"a": 1',
-    "no text": "\udcff\udcfe",
-    "lone half": '"\\ud800"',
-}
-
-
-def put(path: Path, content: str) -> None:
-    path.write_bytes(content.encode("utf-8", "surrogateescape"))
+Store = script("experiments").Store
 
 
 # -- schemas ----------------------------------------------------------------------------------------------------------
@@ -124,7 +104,7 @@ def test_records_behind_a_damaged_line_are_kept_and_a_torn_one_is_cut_off(tmp_pa
         store.append(value)
     put(path, path.read_text().replace("2.0", "nan") + "4.")
     again = Lines(path, number())
-    with pytest.warns(DamagedLine, match=r"lines, line 2: is no JSON .*; the line is ignored"):
+    with pytest.warns(DamagedLine, match=r"lines, line 2: .*JSON.*ignored"):
         assert again.read(ValueError, "")[1] == [(1, 1.0), (3, 3.0)]
     again.append(5.0)
     again.append(6.0)
@@ -233,7 +213,7 @@ def test_a_damaged_first_line_of_a_journal_is_refused_and_nothing_is_lost(name, 
     rest = path.read_bytes().partition(b"\n")[2]
     path.write_bytes(STRANGE[name].encode("utf-8", "surrogateescape") + b"\n" + rest)
     before = path.read_bytes()
-    with pytest.raises(BadSearch, match=r"search.jsonl, line 1: .*; it keeps no search: name a new folder"):
+    with pytest.raises(BadSearch, match=r"search.jsonl, line 1: .*name a new folder"):
         Journal(tmp_path, ABOUT, math.inf)
     assert path.read_bytes() == before
 
@@ -254,9 +234,7 @@ def test_a_journal_is_appended_to_and_never_rewritten(tmp_path):
 @pytest.mark.parametrize("name", STRANGE)
 def test_damaged_settings_of_a_run_are_reported_with_their_file(name, tmp_path):
     put(tmp_path / "settings.json", STRANGE[name])
-    with pytest.raises(
-        ValueError, match=r"settings.json.*remove the folder|holds another run.*another folder"
-    ) as error:
+    with pytest.raises(ValueError, match=r"settings.json.*remove the folder|another run.*another folder") as error:
         Run(tmp_path, {"a": 1})
     assert name == "names" or isinstance(error.value, DamagedRun)
 
@@ -265,9 +243,9 @@ def test_damaged_settings_of_a_run_are_reported_with_their_file(name, tmp_path):
 def test_a_damaged_row_of_a_log_is_named_and_the_others_stay(row, tmp_path):
     run = Run(tmp_path, {"a": 1})
     put(run.log, f"step,loss\n0,1\n{row}\n2,3\n")
-    with pytest.raises(DamagedRun, match=f"log.csv, line 3: found '{row}', expected 2 numbers, of step,loss"):
+    with pytest.raises(DamagedRun, match=f"log.csv, line 3: .*'{row}', expected 2 numbers"):
         run.rows()
-    with pytest.warns(DamagedLine, match="log.csv, line 3: .*; the line is dropped"):
+    with pytest.warns(DamagedLine, match=r"log.csv, line 3: .*; the line is dropped"):
         run.forget_after(9)
     assert run.rows() == [{"step": 0.0, "loss": 1.0}, {"step": 2.0, "loss": 3.0}]
 
@@ -353,7 +331,7 @@ def test_arrays_of_a_store_round_trip_and_damaged_ones_are_refused(tmp_path):
         found = Store(tmp_path, IDENTITY).arrays("a", compute)
         assert np.array_equal(found["heights"], given["heights"])
     put(tmp_path / "a.npz", "no archive")
-    with pytest.raises(DamagedRun, match=r"a.npz: no .npz file .*; remove it to compute it again"):
+    with pytest.raises(DamagedRun, match=r"a.npz: no .npz file .*remove it"):
         Store(tmp_path, IDENTITY).arrays("a", None)
 
 
@@ -392,9 +370,7 @@ def test_damaged_labels_are_refused_in_a_line(tmp_path):
         cases[name] = json.dumps(whole_label | value)
     for name, content in cases.items():
         put(label, content)
-        with pytest.raises(
-            HeightMapError, match=r"rings.npy.json(:\d+)?: is no label of a height map \(.*\); remove"
-        ) as error:
+        with pytest.raises(HeightMapError, match=r"rings.npy.json(:\d+)?: .*height map.*remove") as error:
             read_label(path)
         assert "\n" not in str(error.value), name
         assert len(str(error.value)) < 500, name

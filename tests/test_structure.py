@@ -1,4 +1,4 @@
-"""The number of files that a computation runs through is bounded, and no helper of the tests is written twice."""
+"""No computation calls a higher layer; no helper of the tests is written twice, or imported from a test module."""
 
 import ast
 from collections import defaultdict
@@ -6,17 +6,12 @@ from pathlib import Path
 
 import pytest
 import structure
-from test_layers import parsed
+from layers import parsed
 
 
-@pytest.mark.parametrize(
-    ("computation", "most"),
-    [("read_lens", 10), ("refraction", 5), ('psf(lens, "drt")', 16), ("optimize", 28), ("training step", 23)],
-)
-def test_a_computation_runs_through_few_files_and_calls_no_higher_layer(computation, most):
-    files, upward = structure.walked(structure.walks()[computation])
-    assert len(files) <= most, sorted(files)
-    assert not upward
+@pytest.mark.parametrize("computation", structure.WALKS)
+def test_a_computation_calls_no_higher_layer(computation):
+    assert not structure.walked(structure.walks()[computation])[1]
 
 
 def helpers() -> dict[str, list[str]]:
@@ -40,3 +35,14 @@ def test_no_two_test_files_define_the_same_helper():
     for places in helpers().values():
         files = {place.partition(":")[0] for place in places}
         assert len(files) == 1, f"the same function in {places}"
+
+
+def test_test_modules_import_helpers_alone():
+    """A helper of two test modules is in problems.py, or in a module of helpers."""
+    tests = sorted(Path(__file__).parent.glob("*.py"))
+    modules = {path.stem for path in tests if path.name.startswith("test_")}
+    for path in tests:
+        tree = parsed.__wrapped__(path)  # not stored
+        imports = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        imports |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+        assert not imports & modules, path.name

@@ -6,10 +6,10 @@ import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
+from problems import SHARED
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
@@ -56,7 +56,9 @@ def check_changes(lens, rows, judge, accuracy):
         for limit, change in ((rows.minimum[n], found.minimum[n]), (rows.maximum[n], found.maximum[n])):
             errors = torch.zeros(len(rows), dtype=torch.float64)
             errors[n] = limit
-            assert float(change) == pytest.approx(judge(rt.perturbed(lens, rows, errors)) - nominal, abs=accuracy)
+            assert float(change) == pytest.approx(
+                judge(rt.tolerancing.perturbed(lens, rows, errors)) - nominal, abs=accuracy
+            )
 
 
 def test_changes_at_the_limits_are_those_of_single_lenses(triplet):
@@ -136,7 +138,7 @@ def test_trials_of_a_file_are_not_traced_again(triplet, tmp_path):
 
 def test_compensators_stay_within_their_limits(triplet):
     free = rt.tolerances(triplet, LIMITS)
-    held = dataclasses.replace(free, compensators=(rt.Compensator(7, "thickness", -0.02, 0.03),))
+    held = dataclasses.replace(free, compensators=(rt.system.Compensator(7, "thickness", -0.02, 0.03),))
     found = rt.tolerance(triplet, held, trials=100)
     assert float(found.changes.min()) >= -0.02
     assert float(found.changes.max()) <= 0.03
@@ -182,24 +184,25 @@ def test_wrong_options_are_refused(triplet, words, message):
 def test_compensators_that_the_lens_does_not_have_or_need(triplet):
     rows = rt.tolerances(triplet, LIMITS)
     for one, message in (
-        (rt.Compensator(12), "surfaces 0 to 7"),
-        (rt.Compensator(1, "colour"), "the surface does not have it"),
-        (rt.Compensator(0), "does not improve the criterion"),
-        (rt.Compensator(8), "surfaces 0 to 7"),
+        (rt.system.Compensator(12), "surfaces 0 to 7"),
+        (rt.system.Compensator(1, "colour"), "the surface does not have it"),
+        (rt.system.Compensator(0), "does not improve the criterion"),
+        (rt.system.Compensator(8), "surfaces 0 to 7"),
     ):
         with pytest.raises(rt.BadTolerance, match=message):
             rt.tolerance(triplet, dataclasses.replace(rows, compensators=(one,)), trials=0)
 
 
-FILES = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+FILES = SHARED / "tolerance" / "dev"
 
 
 @pytest.mark.slow
+@pytest.mark.needs(FILES)
 @pytest.mark.parametrize("file", sorted(FILES.glob("*.zmx")), ids=lambda file: file.stem)
 def test_tolerances_of_a_file(file):
     """Whatever light is lost: of SC_Tol_RflScp2 decentres may leave the most clipped of five fields in the dark."""
     found = rt.tolerance(rt.read_lens(file), trials=50, light_loss=1.0)
-    assert len(found.tolerances) == len(rt.read_tolerances(file))
+    assert len(found.tolerances) == len(rt.tolerancing.read_tolerances(file))
     arrives = found.trials.isfinite()
     assert bool((found.lost[~arrives] > 0.15).all())
     assert int(arrives.sum()) >= (45 if file.stem == "SC_Tol_RflScp2" else 50)
@@ -247,11 +250,11 @@ def test_a_yield_that_is_met_leaves_the_limits(triplet):
 
 
 def test_impossible_goals_are_refused(triplet):
-    with pytest.raises(rt.BadTolerance, match="nominal lens itself does not reach the goal"):
+    with pytest.raises(rt.BadTolerance, match=r"nominal lens .* not reach the goal"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, goal=1.0, yield_=0.9)
     with pytest.raises(ValueError, match="a share of the lenses between 0 and 1"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, yield_=90.0)
-    with pytest.raises(ValueError, match="expected a change of the criterion above 0"):
+    with pytest.raises(ValueError, match=r"expected .* above 0"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.0)
 
 
@@ -265,7 +268,7 @@ def test_second_order_of_each_limit(built):
 def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
     lens = rt.read_lens("cooke_triplet")  # auto: off, whose elements are tilted then
     rows = rt.tolerances(lens, grade="precision", compensators=[])
-    assert rt.perturbed(lens, rows, [0.0] * len(rows)).ray_aiming == "off"
+    assert rt.tolerancing.perturbed(lens, rows, [0.0] * len(rows)).ray_aiming == "off"
     nominal = rt.tolerance(lens.at(fields=[0, 8.4, -8.4]), rows, trials=0, rings=4).nominal
     assert float(nominal) == pytest.approx(rms(lens.at(fields=[0, 8.4, -8.4])), abs=1e-9)
 
@@ -275,7 +278,7 @@ PLATE = [{"thickness": 5, "glass": "N-BK7"}, {"thickness": 50}]
 
 def test_a_compensator_without_effect_is_refused():
     plate = rt.lens(PLATE, stop=1, entrance_pupil_diameter=10, fields=[0, 5])
-    with pytest.raises(rt.BadTolerance, match="thickness of surface 2: it does not improve the criterion"):
+    with pytest.raises(rt.BadTolerance, match=r"thickness of surface 2: .*not improve"):
         rt.tolerance(plate, limits="thickness=0.1", trials=0)
 
 
@@ -314,7 +317,7 @@ def test_a_killed_study_loses_nothing(triplet, tmp_path):
 def test_trials_without_light_are_counted_by_every_criterion():
     """A decentre of ±30 mm: some lenses let no light of a field through; they have neither spot nor wavefront."""
     lens = rt.read_lens("cooke_triplet").at(fields=[0, 11.9], ray_aiming="off")
-    rows = rt.Tolerances((rt.Tolerance("element_decenter_y", (1, 2), -30.0, 30.0),))
+    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("element_decenter_y", (1, 2), -30.0, 30.0),))
     dark = [
         rt.tolerance(lens, rows, criterion=name, trials=24, seed=1, rings=2).trials.isnan()
         for name in ("rms", "wavefront")
@@ -337,7 +340,7 @@ def test_the_nominal_criterion_is_that_of_spot(name):
 
 
 def clipped_triplet():
-    rims = {k: (rt.Aperture("circular", (0.0, 10.0)),) for k in (1, 6)}
+    rims = {k: (rt.system.Aperture("circular", (0.0, 10.0)),) for k in (1, 6)}
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="off")
     for k, apertures in rims.items():
         lens = lens.replace(k, apertures=apertures)
@@ -360,8 +363,10 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
         [{"thickness": 1.0}, {"radius": 50.0, "thickness": 5.0, "glass": "N-BK7"}, {"radius": -50.0, "thickness": 45}],
         stop=1, entrance_pupil_diameter=10.0, fields=(0.0,), wavelengths=(0.5876,),
     )  # fmt: skip
-    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, 6.0)),))
-    rows = rt.Tolerances((rt.Tolerance("surface_decenter_x", (1,), -4.0, 4.0), rt.Tolerance("thickness", (2,), -1, 1)))
+    lens = lens.replace(1, apertures=(rt.system.Aperture("circular", (0.0, 6.0)),))
+    rows = rt.tolerancing.Tolerances(
+        (rt.system.Tolerance("surface_decenter_x", (1,), -4.0, 4.0), rt.system.Tolerance("thickness", (2,), -1, 1))
+    )
     d, R, r = 4.0, 6.0, 5.0
     a, b = (math.acos((d * d + s * s - t * t) / (2 * d * s)) for s, t in ((r, R), (R, r)))
     both = r * r * (a - math.sin(2 * a) / 2) + R * R * (b - math.sin(2 * b) / 2)
@@ -384,8 +389,8 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
 
 def test_all_configurations_are_judged():
     lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
-    rows = [rt.Tolerance("operand", (), -0.1, 0.1, configuration=k + 1, operand=0) for k in range(2)]
-    rows = rt.Tolerances((*rows, rt.Tolerance("thickness", (1,), -0.05, 0.05)))
+    rows = [rt.system.Tolerance("operand", (), -0.1, 0.1, configuration=k + 1, operand=0) for k in range(2)]
+    rows = rt.tolerancing.Tolerances((*rows, rt.system.Tolerance("thickness", (1,), -0.05, 0.05)))
     found = rt.tolerance(lens, rows, trials=0)
     assert found.configurations == 2
     assert float(found.maximum.abs().min()) > 1e-4
@@ -393,8 +398,8 @@ def test_all_configurations_are_judged():
         squares = []
         for each in lens.configurations:
             alone = rt.tolerance(
-                dataclasses.replace(rt.perturbed(each, rows, errors), operands=()),
-                rt.Tolerances((rt.Tolerance("thickness", (1,), -1e-9, 1e-9),)), trials=0,
+                dataclasses.replace(rt.tolerancing.perturbed(each, rows, errors), operands=()),
+                rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (1,), -1e-9, 1e-9),)), trials=0,
             )  # fmt: skip
             squares.append(float(alone.nominal) ** 2)
         k = int(errors.argmax())
@@ -404,7 +409,7 @@ def test_all_configurations_are_judged():
 def test_configurations_count_by_their_weights():
     """CWGT 1 and 3: q is the mean by weight; of weights 0 and 1 that of the second one alone; of 0 and 0 the mean."""
     lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
-    rows = rt.Tolerances((rt.Tolerance("thickness", (3,), -0.05, 0.05),))
+    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (3,), -0.05, 0.05),))
 
     def square(weights):
         weight = Operand("CWGT", numbers=torch.tensor(weights, dtype=torch.float64))
@@ -426,10 +431,10 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
     """As CMCO: each configuration has its own sensor distance, so that each is at its best alone."""
     lens = rt.read_lens("cooke_triplet").with_configurations(thickness={2: [12.93, 12.6], 7: [77.4, 77.0]})
     place = next(k for k, operand in enumerate(lens.operands) if operand.number == 7)
-    rows = rt.Tolerance("thickness", (1,), -0.05, 0.05)
-    both = tuple(rt.Compensator(7, configuration=k + 1, operand=place) for k in range(2))
-    found = rt.tolerance(lens, rt.Tolerances((rows,), both), trials=4, rings=6)
-    single = rt.Tolerances((rows,), (rt.Compensator(7),))
+    rows = rt.system.Tolerance("thickness", (1,), -0.05, 0.05)
+    both = tuple(rt.system.Compensator(7, configuration=k + 1, operand=place) for k in range(2))
+    found = rt.tolerance(lens, rt.tolerancing.Tolerances((rows,), both), trials=4, rings=6)
+    single = rt.tolerancing.Tolerances((rows,), (rt.system.Compensator(7),))
     lenses = [dataclasses.replace(each, operands=()) for each in lens.configurations]
     alone = [rt.tolerance(each, single, trials=4, rings=6) for each in lenses]
     expected = math.hypot(*(float(each.nominal) for each in alone)) / 2**0.5
@@ -437,7 +442,11 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
     for k, each in enumerate(alone):
         assert torch.allclose(found.changes[:, k], each.changes[:, 0], atol=1e-6)
     with pytest.raises(rt.BadTolerance, match="2 operands in configurations 1 to 2"):
-        rt.tolerance(lens, rt.Tolerances((rows,), (rt.Compensator(7, configuration=3, operand=place),)), trials=0)
+        rt.tolerance(
+            lens,
+            rt.tolerancing.Tolerances((rows,), (rt.system.Compensator(7, configuration=3, operand=place),)),
+            trials=0,
+        )
 
 
 def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
@@ -449,7 +458,10 @@ def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
         text = file.read_text(encoding="utf-16" if file.read_bytes()[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
         file.write_text(text + "\n".join([*extra, *lines]) + "\n", encoding="utf-8")
         lens = rt.read_lens(file)
-        by_lens, by_file = rt.tolerance(lens, trials=8), rt.tolerance(lens, rt.read_tolerances(file), trials=8)
+        by_lens, by_file = (
+            rt.tolerance(lens, trials=8),
+            rt.tolerance(lens, rt.tolerancing.read_tolerances(file), trials=8),
+        )
         assert len(by_lens.tolerances.compensators) == count
         assert torch.equal(by_lens.trials, by_file.trials)
         assert torch.equal(by_lens.maximum, by_file.maximum)
@@ -459,18 +471,18 @@ def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
 
 
 def test_a_compensator_listed_twice_is_refused(triplet):
-    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.Compensator(7), rt.Compensator(7)])
-    with pytest.raises(rt.BadTolerance, match="two of them do the same to the criterion; leave one out"):
+    rows = rt.tolerances(triplet, "radius=0.1%", compensators=[rt.system.Compensator(7), rt.system.Compensator(7)])
+    with pytest.raises(rt.BadTolerance, match=r"two of them .*leave one out"):
         rt.tolerance(triplet, rows, trials=0)
 
 
 @pytest.mark.parametrize("decentre", [30.0, 60.0])
 def test_trials_without_light_leave_the_figures_of_the_others(triplet, decentre, tmp_path):
     lens = triplet.at(fields=[0, 8.4])
-    rows = rt.Tolerances(
-        (rt.Tolerance("element_decenter_y", (3, 4), -decentre, decentre, distribution="end_points"),
-         rt.Tolerance("element_decenter_y", (1, 2), -0.1, 0.1)),
-        (rt.Compensator(7),),
+    rows = rt.tolerancing.Tolerances(
+        (rt.system.Tolerance("element_decenter_y", (3, 4), -decentre, decentre, distribution="end_points"),
+         rt.system.Tolerance("element_decenter_y", (1, 2), -0.1, 0.1)),
+        (rt.system.Compensator(7),),
     )  # fmt: skip
     if decentre == 30:
         rows = dataclasses.replace(rows, rows=(dataclasses.replace(rows[0], distribution="normal"), rows[1]))
@@ -485,7 +497,7 @@ def test_trials_without_light_leave_the_figures_of_the_others(triplet, decentre,
 
 def rms_angle(lens):
     """RMS angle, mrad, of the directions of rays at the sensor about their mean, of all fields."""
-    points, weights = rt.gauss_rings(12)
+    points, weights = rt.maths.gauss_rings(12)
     directions = image_rays(lens, points).direction.flatten(-2)
     shares = lens.wavelength_weights / lens.wavelength_weights.sum()
     weights = (shares[:, None] * weights).flatten()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from problems import number
+from problems import SHARED, number
 
 import raytrace as rt
 from raytrace.materials.environment import Environment, index_in
@@ -22,7 +22,7 @@ from raytrace.tolerancing.study import moments
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import trace_lens
 
-T = rt.Tolerance
+T = rt.system.Tolerance
 HEAD = """VERS 130000
 MODE SEQ
 UNIT MM X W X CM MR CPMM
@@ -109,7 +109,7 @@ def element(first, last, **known):
 
 
 def test_an_element_is_moved_as_between_two_coordinate_breaks(nominal, tmp_path):
-    found = rt.perturbed(nominal, element(1, 3), MOVE)
+    found = rt.tolerancing.perturbed(nominal, element(1, 3), MOVE)
     s = blocks()
     s[2] = standard(-0.004, -4.5, 0.0, 8.0)
     dummy = standard(0.0, 5.0, 0.0, 8.0)
@@ -121,7 +121,7 @@ def test_an_element_is_moved_as_between_two_coordinate_breaks(nominal, tmp_path)
 @pytest.mark.parametrize("name", NAMES)
 def test_the_sign_of_each_motion_is_that_of_a_coordinate_break(name, nominal, tmp_path):
     move = [0.3 if other == name else 0.0 for other in NAMES]
-    found = rt.perturbed(nominal.replace(4, conic=-3.0), [T(name, (4, 5), -1, 1)], [0.3])
+    found = rt.tolerancing.perturbed(nominal.replace(4, conic=-3.0), [T(name, (4, 5), -1, 1)], [0.3])
     s = blocks()
     s[3] += "\n  CONI -3"
     s[4] = standard(0.01, -2.5, 0.0, 7.0)
@@ -131,7 +131,7 @@ def test_the_sign_of_each_motion_is_that_of_a_coordinate_break(name, nominal, tm
 
 
 def test_a_pivot_lies_behind_the_first_vertex(nominal, tmp_path):
-    found = rt.perturbed(nominal, [T("element_tilt_x", (4, 5), -2, 2, pivot=6.0)], [0.7])
+    found = rt.tolerancing.perturbed(nominal, [T("element_tilt_x", (4, 5), -2, 2, pivot=6.0)], [0.7])
     s = blocks()
     s[2] = standard(-0.004, 11.0, 0.0, 8.0)  # to the pivot
     s[4] = standard(0.01, 3.5, 0.0, 7.0)
@@ -144,7 +144,7 @@ def test_a_pivot_lies_behind_the_first_vertex(nominal, tmp_path):
 def test_elements_move_inside_groups_and_surfaces_inside_elements(nominal, tmp_path):
     rows = [*element(4, 5), T("surface_decenter_x", (4,), -1, 1), *element(1, 5), T("surface_decenter_y", (1,), -1, 1)]
     group = (-0.3, 0.2, -0.5, 0.9, -2.0)
-    found = rt.perturbed(nominal, rows, [*MOVE, 0.15, *group, -0.25])
+    found = rt.tolerancing.perturbed(nominal, rows, [*MOVE, 0.15, *group, -0.25])
     s = blocks()
     s[0] = standard(0.02, 0.0, 1.6, 8.0)
     s[3] = standard(0.03, 0.0, 1.5, 7.0)
@@ -168,13 +168,13 @@ def test_errors_of_mirrors_between_coordinate_breaks(tmp_path):
     front = "  STOP\n  TYPE STANDARD\n  DISZ 20"
     fold = coordinate_break(tilt_x=-40.0)
     nominal = read(tmp_path, front, fold, mirror.format("0"), coordinate_break(tilt_x=-40.0, thickness=-30.0))
-    assert rt.lens_elements(nominal) == [(3, 3)]
-    found = rt.perturbed(nominal, element(3, 3), MOVE)
+    assert rt.tolerancing.lens_elements(nominal) == [(3, 3)]
+    found = rt.tolerancing.perturbed(nominal, element(3, 3), MOVE)
     moved = [coordinate_break(*MOVE), mirror.format("0"), back(*MOVE)]
     explicit = read(tmp_path, front, fold, *moved, coordinate_break(tilt_x=-40.0, thickness=-30.0))
     close(hits(found, nominal), hits(explicit, nominal))
     # a group that contains the breaks
-    found = rt.perturbed(nominal, element(2, 4), MOVE)
+    found = rt.tolerancing.perturbed(nominal, element(2, 4), MOVE)
     inner = [fold, mirror.format("0"), coordinate_break(tilt_x=-40.0)]
     undo = [coordinate_break(tilt_x=40.0), coordinate_break(tilt_x=40.0), back(*MOVE)]
     again = [fold, coordinate_break(tilt_x=-40.0, thickness=-30.0)]
@@ -183,14 +183,14 @@ def test_errors_of_mirrors_between_coordinate_breaks(tmp_path):
 
 
 def test_a_surface_with_a_pose_of_its_own_keeps_it(nominal):
-    inner, behind = rt.Pose(y=0.4, tilt_x=3.0, tilt_z=20.0), rt.Pose(tilt_x=-1.0)
+    inner, behind = rt.system.Pose(y=0.4, tilt_x=3.0, tilt_z=20.0), rt.system.Pose(tilt_x=-1.0)
     posed = nominal.replace(4, before=inner, after=behind)
-    found = rt.perturbed(posed, [*element(4, 4), T("surface_decenter_x", (4,), -1, 1)], [*MOVE, 0.3])
-    shift, outer = (rt.Pose(x=number(0.3)), rt.Pose(*map(number, MOVE[:2]), None, *map(number, MOVE[2:])))
+    found = rt.tolerancing.perturbed(posed, [*element(4, 4), T("surface_decenter_x", (4,), -1, 1)], [*MOVE, 0.3])
+    shift, outer = (rt.system.Pose(x=number(0.3)), rt.system.Pose(*map(number, MOVE[:2]), None, *map(number, MOVE[2:])))
     surface, zero = posed.surfaces[4], number(0.0)
 
     def axes(pose, thickness=zero):
-        return rt.Surface(thickness, before=pose, is_break=True)
+        return rt.system.Surface(thickness, before=pose, is_break=True)
 
     bare = dataclasses.replace(surface, before=shift, after=undone(shift), thickness=zero)
     inner, behind = surface.before, surface.after
@@ -257,22 +257,22 @@ def errors(factor=1.0):
 
 @pytest.mark.parametrize("place", range(len(ROWS)), ids=lambda place: f"{place}-{ROWS[place][0].kind}")
 def test_every_kind_of_error_is_written_and_read_back(place, asphere, tmp_path):
-    found = rt.perturbed(asphere, *zip(*(ROWS[k] for k in sorted({place, 19, 20})), strict=True))
+    found = rt.tolerancing.perturbed(asphere, *zip(*(ROWS[k] for k in sorted({place, 19, 20})), strict=True))
     rt.write_lens(found, tmp_path / "lens.zmx")
     close(hits(rt.read_lens(tmp_path / "lens.zmx")), hits(found), atol=1e-11)
 
 
 def test_all_kinds_of_errors_are_written_and_read_back(asphere, tmp_path):
-    found = rt.perturbed(asphere, *zip(*ROWS, strict=True))
+    found = rt.tolerancing.perturbed(asphere, *zip(*ROWS, strict=True))
     rt.write_lens(found, tmp_path / "lens.zmx")
     close(hits(rt.read_lens(tmp_path / "lens.zmx")), hits(found), atol=1e-11)
 
 
 def test_no_error_is_the_nominal_lens(asphere):
     rows = [row for row, _ in ROWS]
-    close(hits(rt.perturbed(asphere, rows, errors(0.0)), asphere), hits(asphere), 1e-13)
+    close(hits(rt.tolerancing.perturbed(asphere, rows, errors(0.0)), asphere), hits(asphere), 1e-13)
     for row, value in ROWS:
-        moved = hits(rt.perturbed(asphere, [row], [value]), asphere) - hits(asphere)
+        moved = hits(rt.tolerancing.perturbed(asphere, [row], [value]), asphere) - hits(asphere)
         alone = ("irregularity_angle", "element_roll")  # nothing turns but what is round
         assert (moved.abs().max() > 1e-7) == (row.kind not in alone), row
 
@@ -281,10 +281,10 @@ def test_no_error_is_the_nominal_lens(asphere):
 def test_a_batch_of_lenses_is_each_of_them(engine, asphere, compiler):
     rows = [row for row, _ in ROWS]
     batch = torch.stack([errors(factor) for factor in (1.0, -0.5, 0.0)])
-    with rt.trace_engine(engine):
-        together = hits(rt.perturbed(asphere, rows, batch), asphere)
+    with rt.tracing.trace_engine(engine):
+        together = hits(rt.tolerancing.perturbed(asphere, rows, batch), asphere)
         for k, one in enumerate(batch):
-            close(together[:, k], hits(rt.perturbed(asphere, rows, one), asphere), 1e-13)
+            close(together[:, k], hits(rt.tolerancing.perturbed(asphere, rows, one), asphere), 1e-13)
 
 
 @pytest.mark.parametrize("place", range(len(ROWS)))
@@ -293,7 +293,7 @@ def test_the_derivative_by_an_error_is_that_of_the_rays(place, asphere):
     weights = torch.linspace(-1, 1, 6, dtype=torch.float64)[:, None, None, None]
 
     def total(values):
-        return (weights * hits(rt.perturbed(asphere, rows, values), asphere)).sum()
+        return (weights * hits(rt.tolerancing.perturbed(asphere, rows, values), asphere)).sum()
 
     values = errors().requires_grad_()
     (slope,) = torch.autograd.grad(total(values), values)
@@ -307,13 +307,13 @@ def test_the_derivative_by_an_error_is_that_of_the_rays(place, asphere):
 
 def test_the_derivative_by_a_number_of_the_lens(nominal):
     curvature = number(0.02).requires_grad_()
-    found = rt.perturbed(nominal.replace(1, curvature=curvature), [T("radius", (1,), -1, 1)], [0.5])
+    found = rt.tolerancing.perturbed(nominal.replace(1, curvature=curvature), [T("radius", (1,), -1, 1)], [0.5])
     (slope,) = torch.autograd.grad(found.surfaces[1].curvature, curvature)
     assert float(slope) == pytest.approx(1 / (1 + 0.02 * 0.5) ** 2, rel=1e-14)
 
 
 def test_what_no_error_touches_stays_the_same(nominal):
-    found = rt.perturbed(nominal, [T("thickness", (2,), -1, 1)], [0.1])
+    found = rt.tolerancing.perturbed(nominal, [T("thickness", (2,), -1, 1)], [0.1])
     for k, (old, new) in enumerate(zip(nominal.surfaces, found.surfaces, strict=True)):
         assert (old is new) == (k != 2)
     assert found.surfaces[2].curvature is nominal.surfaces[2].curvature
@@ -322,11 +322,13 @@ def test_what_no_error_touches_stays_the_same(nominal):
 
 def test_a_fringe_of_power_is_half_a_wave_of_sag_at_the_semi_diameter(nominal):
     lens = nominal.replace(1, conic=-0.7)
-    found = rt.perturbed(lens, rt.Tolerances((T("power", (1,), -9, 9),), test_wavelength=0.5), [3.0])
+    found = rt.tolerancing.perturbed(
+        lens, rt.tolerancing.Tolerances((T("power", (1,), -9, 9),), test_wavelength=0.5), [3.0]
+    )
     h = number(8.0)
     old, new = (sag_at(one.surfaces[1], 0 * h, h) for one in (lens, found))
     assert float(new - old) == pytest.approx(3 * 0.25e-3, rel=1e-9)
-    plane = rt.perturbed(nominal.replace(1, curvature=None), [T("power", (1,), -9, 9)], [2.0])
+    plane = rt.tolerancing.perturbed(nominal.replace(1, curvature=None), [T("power", (1,), -9, 9)], [2.0])
     assert float(sag_at(plane.surfaces[1], h, 0 * h)) == pytest.approx(0.6328e-3, rel=1e-12)
 
 
@@ -344,7 +346,7 @@ TILTS = {
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_a_tilted_sphere_is_the_sphere_about_a_moved_centre(name, k, nominal):
     kind, value, tilts = TILTS[name]
-    found = rt.perturbed(nominal, [T(kind, (k, k) if kind.startswith("element") else (k,), -1, 1)], [value])
+    found = rt.tolerancing.perturbed(nominal, [T(kind, (k, k) if kind.startswith("element") else (k,), -1, 1)], [value])
     tilt_x, tilt_y = map(math.radians, tilts)
     axis = np.array([math.sin(tilt_y), -math.sin(tilt_x) * math.cos(tilt_y), math.cos(tilt_x) * math.cos(tilt_y)])
     start = launch(
@@ -376,7 +378,7 @@ def test_the_change_by_a_wedge_is_that_of_a_decentred_sphere():
     step = radius * math.sin(math.radians(0.1))
     rows.append(T("element_decenter_y", (1, 1), -step, step))
     rows, rays = (
-        rt.Tolerances(tuple(rows), (rt.Compensator(11),)),
+        rt.tolerancing.Tolerances(tuple(rows), (rt.system.Compensator(11),)),
         {"fields": [0, 10, 14, -10, -14], "rings": 4, "arms": 6},
     )
     tilt, element, decentre = rt.tolerance(lens, rows, trials=0, **rays).maximum
@@ -388,7 +390,7 @@ def test_the_change_by_a_wedge_is_that_of_a_decentred_sphere():
 @pytest.mark.parametrize("angle", [0.0, 30.0])
 def test_irregularity_is_half_spherical_half_astigmatism(angle, nominal):
     rows = [T("irregularity", (2,), -9, 9), T("irregularity_angle", (2,), -90, 90)]
-    found = rt.perturbed(nominal, rows, [2.0, angle])
+    found = rt.tolerancing.perturbed(nominal, rows, [2.0, angle])
     x, y = torch.meshgrid(*[torch.linspace(-8, 8, 9, dtype=torch.float64)] * 2, indexing="ij")
     added = sag_at(found.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
     turn = math.radians(angle)
@@ -402,7 +404,7 @@ def test_irregularity_is_half_spherical_half_astigmatism(angle, nominal):
 
 
 def test_the_limit_of_a_zernike_term_is_its_rms(nominal):
-    found = rt.perturbed(nominal, [T("zernike", (2,), -1, 1, term=11)], [1e-3])
+    found = rt.tolerancing.perturbed(nominal, [T("zernike", (2,), -1, 1, term=11)], [1e-3])
     x, y = 8 * torch.randn(2, 40_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64).clamp(-1, 1)
     rho2 = (x * x + y * y) / 64
     added = sag_at(found.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
@@ -421,7 +423,7 @@ SAGS = {
 def test_sag_terms_stay_under_an_error(name, nominal):
     lens = nominal.replace(2, sag_terms=SAGS[name])
     rows = [T("irregularity", (2,), -9, 9), T("zernike", (2,), -1, 1, term=3)]
-    found = rt.perturbed(lens, rows, [3.0, 0.1])
+    found = rt.tolerancing.perturbed(lens, rows, [3.0, 0.1])
     x, y = torch.tensor([[0.0, 3.0, -5.0], [1.0, -2.0, 4.0]], dtype=torch.float64)
     added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64) + 0.1 * 2 * y / 8
     close(sag_at(found.surfaces[2], x, y), sag_at(lens.surfaces[2], x, y) + added, 1e-15)
@@ -434,7 +436,7 @@ def test_heights_of_a_grid_stay_under_an_error(nominal):
     added = 3 * 0.6328e-3 / 4 * (((x * x + y * y) / 64) ** 2 + y * y / 64)
     spline_lens = nominal.replace(2, sag_terms=spline(lens.surfaces[2].sag_terms))
     for one in (lens, spline_lens):
-        found = rt.perturbed(one, [T("irregularity", (2,), -9, 9)], [3.0])
+        found = rt.tolerancing.perturbed(one, [T("irregularity", (2,), -9, 9)], [3.0])
         close(sag_at(found.surfaces[2], x, y), sag_at(one.surfaces[2], x, y) + added, 1e-9)
 
 
@@ -442,7 +444,7 @@ def test_heights_of_a_grid_stay_under_an_error(nominal):
 
 
 def test_an_index_error_moves_the_index_at_all_wavelengths_and_an_abbe_error_turns_it_about_d():
-    glass = rt.find_glass("N-BK7")
+    glass = rt.materials.find_glass("N-BK7")
     wavelengths = torch.tensor([LINES["d"], LINES["F"], LINES["C"], 1.0], dtype=torch.float64)
     found = with_index_errors(glass, index=number(2e-3))
     close(index(found, wavelengths), index(glass, wavelengths) + 2e-3, 1e-15)
@@ -458,7 +460,7 @@ def test_an_index_error_moves_the_index_at_all_wavelengths_and_an_abbe_error_tur
 
 
 def test_a_glass_with_errors_keeps_its_thermal_coefficients():
-    glass = rt.find_glass("N-BK7")
+    glass = rt.materials.find_glass("N-BK7")
     hot = Environment(number(60.0), number(1.0))
     at = torch.tensor([0.5, 0.6], dtype=torch.float64)
     found = index_in(with_index_errors(glass, index=number(1e-4)), at, hot)
@@ -467,7 +469,7 @@ def test_a_glass_with_errors_keeps_its_thermal_coefficients():
 
 def test_a_glass_without_dispersion_has_no_abbe_error(nominal):
     with pytest.raises(rt.BadTolerance, match="no dispersion"):
-        rt.perturbed(nominal, [T("abbe", (1,), -1, 1)], [0.5])
+        rt.tolerancing.perturbed(nominal, [T("abbe", (1,), -1, 1)], [0.5])
     with pytest.raises(InvalidIndex, match="no Abbe number"):
         with_index_errors(nominal.surfaces[1].glass, abbe=number(0.5))
     assert not [row for row in rt.tolerances(nominal, grade="precision") if row.kind == "abbe"]
@@ -478,20 +480,27 @@ def test_a_glass_without_dispersion_has_no_abbe_error(nominal):
 
 
 def test_elements_are_found_from_the_media(nominal):
-    assert rt.lens_elements(nominal) == [(1, 2), (2, 3), (4, 5)]
-    assert rt.cemented_groups(nominal) == [(1, 3)]
-    assert rt.lens_elements(rt.read_lens("double_gauss")) == [(1, 2), (3, 4), (4, 5), (7, 8), (8, 9), (10, 11)]
-    assert rt.cemented_groups(rt.read_lens("double_gauss")) == [(3, 5), (7, 9)]
+    assert rt.tolerancing.lens_elements(nominal) == [(1, 2), (2, 3), (4, 5)]
+    assert rt.tolerancing.cemented_groups(nominal) == [(1, 3)]
+    assert rt.tolerancing.lens_elements(rt.read_lens("double_gauss")) == [
+        (1, 2),
+        (3, 4),
+        (4, 5),
+        (7, 8),
+        (8, 9),
+        (10, 11),
+    ]
+    assert rt.tolerancing.cemented_groups(rt.read_lens("double_gauss")) == [(3, 5), (7, 9)]
 
 
 def test_a_plane_inside_glass_belongs_to_the_element_and_a_mirror_inside_glass_too(nominal):
     glass, zero = nominal.surfaces[1].glass, number(1.0)
-    inside = rt.Surface(zero, glass=glass)
+    inside = rt.system.Surface(zero, glass=glass)
     surfaces = (*nominal.surfaces[:2], inside, *nominal.surfaces[2:])
-    assert rt.lens_elements(dataclasses.replace(nominal, surfaces=surfaces))[0] == (1, 3)
-    mirror = rt.Surface(-zero, glass=rt.MIRROR)
-    surfaces = (*nominal.surfaces[:2], mirror, rt.Surface(zero), nominal.surfaces[-1])
-    assert rt.lens_elements(dataclasses.replace(nominal, surfaces=surfaces)) == [(1, 3)]
+    assert rt.tolerancing.lens_elements(dataclasses.replace(nominal, surfaces=surfaces))[0] == (1, 3)
+    mirror = rt.system.Surface(-zero, glass=rt.materials.MIRROR)
+    surfaces = (*nominal.surfaces[:2], mirror, rt.system.Surface(zero), nominal.surfaces[-1])
+    assert rt.tolerancing.lens_elements(dataclasses.replace(nominal, surfaces=surfaces)) == [(1, 3)]
 
 
 def test_the_page_of_kinds_is_that_of_the_table():
@@ -505,10 +514,10 @@ def test_the_page_of_kinds_is_that_of_the_table():
 
 def test_a_trial_is_the_same_in_any_batch():
     rows = [row for row, _ in ROWS]
-    every = rt.draw_errors(rows, 20, seed=7)
-    assert torch.equal(every[5:9], rt.draw_errors(rows, 4, seed=7, first=5))
-    assert not torch.equal(every, rt.draw_errors(rows, 20, seed=8))
-    fewer = rt.draw_errors(rows[:3], 20, seed=7)
+    every = rt.tolerancing.draw_errors(rows, 20, seed=7)
+    assert torch.equal(every[5:9], rt.tolerancing.draw_errors(rows, 4, seed=7, first=5))
+    assert not torch.equal(every, rt.tolerancing.draw_errors(rows, 20, seed=8))
+    fewer = rt.tolerancing.draw_errors(rows[:3], 20, seed=7)
     assert torch.equal(every[:, :3], fewer)
 
 
@@ -523,7 +532,7 @@ def test_a_trial_is_the_same_in_any_batch():
 )
 def test_errors_have_their_distribution(distribution, variance):
     row = T("thickness", (1,), 1.0, 3.0, distribution=distribution, sigmas=1.5)
-    errors = rt.draw_errors([row], 40_000, seed=3)[:, 0] - 2.0
+    errors = rt.tolerancing.draw_errors([row], 40_000, seed=3)[:, 0] - 2.0
     assert errors.abs().max() <= 1
     if variance is None:  # of the normal distribution truncated at 1.5 standard deviations
         a = 1.5
@@ -535,16 +544,16 @@ def test_errors_have_their_distribution(distribution, variance):
 
 def test_rows_of_a_group_share_an_rms():
     rows = [T("zernike", (1,), -2e-4, 2e-4, term=j, group="a", distribution="end_points") for j in (4, 5, 6, 7)]
-    errors = rt.draw_errors([*rows, T("thickness", (1,), -1, 1)], 50)
+    errors = rt.tolerancing.draw_errors([*rows, T("thickness", (1,), -1, 1)], 50)
     torch.testing.assert_close((errors[:, :4] ** 2).sum(1).sqrt(), torch.full((50,), 4e-4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("distribution", ["normal", "uniform", "parabolic"])
 def test_the_errors_of_a_group_have_a_random_direction_and_the_size_of_a_row(distribution):
     rows = [T(f"surface_decenter_{axis}", (1,), -0.1, 0.1, group="a", distribution=distribution) for axis in "xy"]
-    errors = rt.draw_errors(rows, 20_000)
+    errors = rt.tolerancing.draw_errors(rows, 20_000)
     size = errors.square().sum(1).sqrt() / math.sqrt(2)
-    alone = rt.draw_errors([dataclasses.replace(rows[0], group="")], 20_000).abs().flatten()
+    alone = rt.tolerancing.draw_errors([dataclasses.replace(rows[0], group="")], 20_000).abs().flatten()
     quantiles = torch.linspace(0.1, 1, 9, dtype=torch.float64)
     assert torch.allclose(torch.quantile(size, quantiles), torch.quantile(alone, quantiles), atol=2.5e-3)
     angle = torch.atan2(errors[:, 1], errors[:, 0])
@@ -558,7 +567,7 @@ def test_the_errors_of_a_group_have_a_random_direction_and_the_size_of_a_row(dis
 def test_errors_of_a_table_have_its_density():
     density = ((0.0, 0.0), (0.2, 3.0), (0.5, 0.0), (0.9, 1.0), (1.0, 1.0))
     row = T("thickness", (1,), -1.0, 3.0, distribution="table", density=density)
-    errors = rt.draw_errors([row], 50_000)[:, 0]
+    errors = rt.tolerancing.draw_errors([row], 50_000)[:, 0]
     x, p = np.array(density).T
     fine = np.linspace(0, 1, 4001)
     share = np.interp(fine, x, p)
@@ -569,7 +578,7 @@ def test_errors_of_a_table_have_its_density():
     assert float(errors.mean()) == pytest.approx(mean, abs=0.02)
     assert float(errors.var()) == pytest.approx(variance, rel=0.02)
     with pytest.raises(rt.BadTolerance, match="rising fractions"):
-        rt.draw_errors([dataclasses.replace(row, density=((0.5, 1.0), (0.2, 1.0)))], 1)
+        rt.tolerancing.draw_errors([dataclasses.replace(row, density=((0.5, 1.0), (0.2, 1.0)))], 1)
 
 
 # -- what a lens does not have ----------------------------------------------------------------------------------------
@@ -596,7 +605,7 @@ def test_errors_of_a_table_have_its_density():
 )
 def test_a_tolerance_that_the_lens_does_not_have_is_refused(row, message, nominal):
     with pytest.raises(rt.BadTolerance, match=message):
-        rt.perturbed(nominal, [row], [0.0])
+        rt.tolerancing.perturbed(nominal, [row], [0.0])
 
 
 def test_elements_that_share_a_cemented_surface_are_refused_with_the_fix(nominal):
@@ -604,27 +613,27 @@ def test_elements_that_share_a_cemented_surface_are_refused_with_the_fix(nominal
         r"shares the cemented surface 2 with 1-2 .* tolerance the cemented group \(1, 3\), or the surfaces \(3, 3\)"
     )
     with pytest.raises(rt.BadTolerance, match=message):
-        rt.perturbed(nominal, [*element(1, 2), *element(2, 3)], torch.zeros(10))
+        rt.tolerancing.perturbed(nominal, [*element(1, 2), *element(2, 3)], torch.zeros(10))
 
 
 def test_elements_that_share_a_part_are_refused(nominal):
     with pytest.raises(rt.BadTolerance, match="shares a part of surfaces 1-3"):
-        rt.perturbed(nominal, [*element(1, 3), *element(2, 5)], torch.zeros(10))
+        rt.tolerancing.perturbed(nominal, [*element(1, 3), *element(2, 5)], torch.zeros(10))
 
 
 def test_a_radius_of_a_plane_and_a_wrong_number_of_errors_are_refused(nominal):
     with pytest.raises(rt.BadTolerance, match="plane"):
-        rt.perturbed(nominal.replace(1, curvature=None), [T("radius", (1,), -1, 1)], [0.1])
+        rt.tolerancing.perturbed(nominal.replace(1, curvature=None), [T("radius", (1,), -1, 1)], [0.1])
     with pytest.raises(rt.BadTolerance, match=r"expected \(1,\)"):
-        rt.perturbed(nominal, [T("radius", (1,), -1, 1)], [0.1, 0.2])
+        rt.tolerancing.perturbed(nominal, [T("radius", (1,), -1, 1)], [0.1, 0.2])
 
 
 def test_a_surface_that_no_ray_reaches_has_no_fringes(nominal):
     bare = nominal.replace(1, semi_diameter=None).replace(3, thickness=-1e9)
     lens = dataclasses.replace(bare, optimization_data=None)
-    lens = lens.replace(1, apertures=(rt.Aperture("circular", (0.0, 1e-9), centre=(500.0, 0.0)),))
+    lens = lens.replace(1, apertures=(rt.system.Aperture("circular", (0.0, 1e-9), centre=(500.0, 0.0)),))
     with pytest.raises(rt.BadTolerance, match="no semi-diameter"):
-        rt.perturbed(lens, [T("power", (1,), -1, 1)], [1.0])
+        rt.tolerancing.perturbed(lens, [T("power", (1,), -1, 1)], [1.0])
 
 
 # -- the lines of a file ----------------------------------------------------------------------------------------------
@@ -664,7 +673,7 @@ def with_lines(tmp_path, tail: str, head: str = HEAD):
 
 def test_every_line_is_read_or_named(tmp_path):
     path = with_lines(tmp_path, TAIL)
-    found = rt.read_tolerances(path)
+    found = rt.tolerancing.read_tolerances(path)
     assert found.test_wavelength == 0.5461
     assert [(row.kind, row.surfaces, row.minimum, row.maximum) for row in found[:6]] == [
         ("radius", (1,), -0.2, 0.2),
@@ -694,12 +703,12 @@ def test_every_line_is_read_or_named(tmp_path):
     checked = rt.check(path)
     assert [text.split(": ")[1] for text in checked.unread_tolerances] == ["ISOB", "TQQQ", "TOFF"]
     assert "    not read: tolerance line:20: TQQQ: an operand that is not known" in str(checked).splitlines()
-    draws = rt.draw_errors(found, 4)
-    assert rt.perturbed(rt.read_lens(path), found, draws).surfaces[4].coefficients.shape == (2, 4, 1, 1, 1)
+    draws = rt.tolerancing.draw_errors(found, 4)
+    assert rt.tolerancing.perturbed(rt.read_lens(path), found, draws).surfaces[4].coefficients.shape == (2, 4, 1, 1, 1)
 
 
 def lines_of(tmp_path, *lines):
-    return rt.read_tolerances(with_lines(tmp_path, "".join(f"TOL {line}\n" for line in lines)))
+    return rt.tolerancing.read_tolerances(with_lines(tmp_path, "".join(f"TOL {line}\n" for line in lines)))
 
 
 def test_radial_decentres_are_groups_of_both_components(tmp_path):
@@ -711,7 +720,7 @@ def test_radial_decentres_are_groups_of_both_components(tmp_path):
         ("element_decenter_x", (1, 3), pytest.approx(0.1 / math.sqrt(2)), "uniform"),
         ("element_decenter_y", (1, 3), pytest.approx(0.1 / math.sqrt(2)), "uniform"),
     ]
-    sizes = rt.draw_errors(found, 500)[:, :2].square().sum(1).sqrt()
+    sizes = rt.tolerancing.draw_errors(found, 500)[:, :2].square().sum(1).sqrt()
     assert 0.19 < float(sizes.max()) <= 0.2
     assert float(sizes.mean()) == pytest.approx(0.1, rel=0.1)
     assert found.leaders.tolist() == [0, 0, 2, 2]
@@ -724,10 +733,10 @@ def test_a_roll_turns_an_element_about_the_centre_of_its_seat(nominal, tmp_path)
     assert (angle_y.kind, angle_y.maximum, angle_y.pivot) == ("element_tilt_y", 2, pytest.approx(2.5 + 1 / 0.01))
     # the seat is the same sphere, with its vertex elsewhere
     for row, limit, axis in ((along_x, along_x.minimum, 0), (along_y, along_y.maximum, 1)):
-        rolled = rt.perturbed(nominal, [row], [limit])
+        rolled = rt.tolerancing.perturbed(nominal, [row], [limit])
         pose = pose_of(rows_along([rolled.surfaces[4].before]))
         assert float((pose.x, pose.y)[axis]) == pytest.approx(0.2, rel=1e-12)
-        rear = rt.perturbed(nominal, [T(row.kind, (5, 5), -9, 9, pivot=row.pivot - 2.5)], [limit])
+        rear = rt.tolerancing.perturbed(nominal, [T(row.kind, (5, 5), -9, 9, pivot=row.pivot - 2.5)], [limit])
         close(hits(rolled, nominal), hits(rear, nominal), 1e-10)
     assert [row.kind for row in radial] == ["element_tilt_y", "element_tilt_x"]
     assert {row.group for row in radial} == {radial[0].source}
@@ -736,7 +745,7 @@ def test_a_roll_turns_an_element_about_the_centre_of_its_seat(nominal, tmp_path)
 def test_a_roll_on_a_plane_is_a_decentre_and_by_an_angle_nothing(tmp_path):
     path = with_lines(tmp_path, "TOL TRLX 4 5 -0.1 0.2\nTOL TARX 4 5 -0.1 0.2\n")
     path.write_text(path.read_text("utf-8").replace("CURV 0.03 0 0 0 0", "CURV 0 0 0 0 0"), encoding="utf-8")
-    found = rt.read_tolerances(path)
+    found = rt.tolerancing.read_tolerances(path)
     assert [(row.kind, row.minimum, row.maximum) for row in found] == [("element_decenter_x", -0.1, 0.2)]
     assert "plane surface 4" in found.unread[0]
 
@@ -752,9 +761,9 @@ def test_pivots_of_tilts_of_elements(tmp_path):
 def test_fringe_terms_of_a_file_have_their_sum_of_squares_at_the_rim(nominal, tmp_path):
     found = lines_of(tmp_path, "TWAV 0 0 0.5", "TEXI 2 8 -3 3 5")
     assert [(row.kind, row.term, row.group != "") for row in found] == [("fringe", j, True) for j in range(5, 9)]
-    draws = rt.draw_errors(found, 20)
+    draws = rt.tolerancing.draw_errors(found, 20)
     torch.testing.assert_close(draws.square().sum(1).sqrt(), torch.full((20,), 3.0).double())
-    lens = rt.perturbed(nominal, dataclasses.replace(found, rows=found.rows[:1]), [3.0])
+    lens = rt.tolerancing.perturbed(nominal, dataclasses.replace(found, rows=found.rows[:1]), [3.0])
     x, y = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0]], dtype=torch.float64)
     added = sag_at(lens.surfaces[2], x, y) - sag_at(nominal.surfaces[2], x, y)
     close(added, 3 * 0.25e-3 * torch.tensor([1.0, -1.0, 0.0]).double(), 1e-15)  # ρ² cos 2φ, half a wave a fringe
@@ -763,11 +772,11 @@ def test_fringe_terms_of_a_file_have_their_sum_of_squares_at_the_rim(nominal, tm
 def test_a_table_of_a_distribution_lies_beside_the_file(tmp_path):
     tail = "TOL STAT 3 0 0 0 0 0 0\nTCMM lot.dat\nTOL TTHI 1 3 -0.1 0.1 0 0 0\n"
     path = with_lines(tmp_path, tail)
-    without = rt.read_tolerances(path)
+    without = rt.tolerancing.read_tolerances(path)
     assert without[0].distribution == "normal"
     assert "lot.dat is not beside the file" in without.unread[0]
     (tmp_path / "lot.dat").write_text("0 1\n0.5 0\n1 3\n")
-    found = rt.read_tolerances(path)
+    found = rt.tolerancing.read_tolerances(path)
     assert (found[0].distribution, found[0].density) == ("table", ((0.0, 1.0), (0.5, 0.0), (1.0, 3.0)))
     assert rt.tolerances(rt.read_lens(path))[0].density == found[0].density  # the lens holds the table
     (tmp_path / "lot.dat").write_text("0 1\n0.5 x\n")
@@ -782,7 +791,7 @@ def test_a_group_is_at_its_limits_at_once_and_a_line_of_the_table(tmp_path):
     lens = rt.focus(lens).lens
     built = rt.tolerance(lens, found, trials=0)
     nominal, least, most = (
-        rt.focus(rt.perturbed(lens, found, errors), rings=8).lens
+        rt.focus(rt.tolerancing.perturbed(lens, found, errors), rings=8).lens
         for errors in (torch.zeros(5), *(found.alone(limits)[0] for limits in (found.minimum, found.maximum)))
     )
     sizes = [1e3 * float(rt.spot(one, rings=8).rms_radius) for one in (nominal, least, most)]
@@ -801,7 +810,7 @@ def test_a_group_is_at_its_limits_at_once_and_a_line_of_the_table(tmp_path):
 
 def test_lengths_of_a_file_in_inches_become_millimetres(tmp_path):
     lines = "TOL COMP 5 0 -2 2\nTOL TRAD 1 0 -0.2 0.2\nTOL TCUR 1 0 -0.1 0.1\nTOL TETX 1 3 -1 1\nTOL TPAR 4 2 -1 1\n"
-    found = rt.read_tolerances(with_lines(tmp_path, lines, HEAD.replace("UNIT MM", "UNIT IN")))
+    found = rt.tolerancing.read_tolerances(with_lines(tmp_path, lines, HEAD.replace("UNIT MM", "UNIT IN")))
     limits = [row.maximum for row in found]
     assert limits == pytest.approx([0.2 * 25.4, 0.1 / 25.4, 1.0, 25.4**-3])
     assert found.compensators[0].maximum == pytest.approx(2 * 25.4)
@@ -828,24 +837,24 @@ def test_lengths_of_a_file_in_inches_become_millimetres(tmp_path):
 )
 def test_a_line_that_the_lens_does_not_have_is_refused(line, message, tmp_path):
     with pytest.raises(rt.LensFileError, match=message):
-        rt.read_tolerances(with_lines(tmp_path, line + "\n"))
+        rt.tolerancing.read_tolerances(with_lines(tmp_path, line + "\n"))
 
 
 def test_a_file_without_tolerances_is_refused(tmp_path):
     with pytest.raises(rt.LensFileError, match="no lines of tolerances"):
-        rt.read_tolerances(with_lines(tmp_path, ""))
+        rt.tolerancing.read_tolerances(with_lines(tmp_path, ""))
 
 
-DEVELOPMENT = Path(__file__).parents[2] / "shared" / "tolerance" / "dev"
+DEVELOPMENT = SHARED / "tolerance" / "dev"
 #: Rows of each file, with an angle for each irregularity.
 REAL = {"SC_Tol_Cooke": 47, "SC_Tol_singlet2": 11, "sc_tol_DblPass3": 17, "sc_tol_scan1": 26, "ASL10142-1064": 9}
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 @pytest.mark.parametrize("name", REAL)
 def test_files_of_others_are_read_and_their_lenses_made(name):
     path = DEVELOPMENT / f"{name}.zmx"
-    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    lens, found = rt.read_lens(path), rt.tolerancing.read_tolerances(path)
     text = path.read_bytes()
     text = text.decode("utf-16" if text[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8")
     lines = [line for line in text.splitlines() if line.startswith("TOL ")]
@@ -853,27 +862,27 @@ def test_files_of_others_are_read_and_their_lenses_made(name):
     assert len(found) - angles + len(found.compensators) + 1 == len(lines)
     assert len(found) == REAL[name]
     assert not found.unread
-    draws = rt.draw_errors(found, 2, seed=5)
+    draws = rt.tolerancing.draw_errors(found, 2, seed=5)
     for one in lens.configurations:
-        together = rt.perturbed(one, found, draws)
-        alone = rt.perturbed(one, found, draws[1])
+        together = rt.tolerancing.perturbed(one, found, draws)
+        alone = rt.tolerancing.perturbed(one, found, draws[1])
         rays = launch(one, torch.tensor([[0.0, 0.3], [0.2, -0.4]], dtype=torch.float64))
         ends = [trace_lens(made, rays, one.primary) for made in (together, alone)]
         assert ends[1].valid.any()
         close(ends[0].position[:, 1], ends[1].position, 1e-12)
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 def test_errors_of_a_lens_in_double_pass_are_in_both_passes():
     path = DEVELOPMENT / "sc_tol_DblPass3.zmx"
-    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    lens, found = rt.read_lens(path), rt.tolerancing.read_tolerances(path)
     errors = torch.zeros(len(found), dtype=torch.float64)
     values = {"radius of surface 2": 0.2, "thickness of surface 2": 0.1, "index of surface 2": 1e-3}
     values |= {"parameter x of surface 1": 0.15, "parameter tilt_x of surface 1": 0.1}
     values |= {"irregularity of surface 3": 0.2, "surface_decenter_x of surface 2": 0.05}
     for label, value in values.items():
         errors[found.labels.index(label)] = value
-    s = rt.perturbed(lens, found, errors).surfaces
+    s = rt.tolerancing.perturbed(lens, found, errors).surfaces
     assert float(1 / s[10].curvature) == pytest.approx(float(1 / s[2].curvature), rel=1e-14)
     assert float(1 / s[2].curvature - 1 / lens.surfaces[2].curvature) == pytest.approx(0.2, rel=1e-9)
     assert [float(s[k].thickness) for k in (2, 3, 4)] == pytest.approx([4.3, -4.3, 4.3])
@@ -888,12 +897,12 @@ def test_errors_of_a_lens_in_double_pass_are_in_both_passes():
     assert [float(s[k].before.x) for k in (2, 10)] == pytest.approx([0.05, 0.05])
 
 
-@pytest.mark.skipif(not DEVELOPMENT.exists(), reason="the development files are not here")
+@pytest.mark.needs(DEVELOPMENT)
 def test_an_error_of_an_operand_is_in_its_configuration_alone():
     path = DEVELOPMENT / "sc_tol_scan1.zmx"
-    lens, found = rt.read_lens(path), rt.read_tolerances(path)
+    lens, found = rt.read_lens(path), rt.tolerancing.read_tolerances(path)
     place = next(k for k, row in enumerate(found) if row.kind == "operand" and row.configuration == 2)
-    made = rt.perturbed(lens, found, torch.zeros(len(found)).index_fill(0, torch.tensor(place), 0.5))
+    made = rt.tolerancing.perturbed(lens, found, torch.zeros(len(found)).index_fill(0, torch.tensor(place), 0.5))
     angles = [float(one.surfaces[3].before.tilt_x) for one in made.configurations]
     assert angles == pytest.approx([-10, -4.5, 0, 5, 10])
     assert [float(one.surfaces[5].before.tilt_x) for one in made.configurations] == pytest.approx([10, 4.5, 0, -5, -10])
@@ -924,7 +933,7 @@ def test_a_radius_may_differ_by_the_larger_of_its_part_and_of_fringes(nominal):
     assert [row.surfaces for row in found if row.kind == "power"] == [(2,), (3,), (5,)]
     plane = rt.tolerances(nominal.replace(1, curvature=None), grade="high")
     assert (1,) in [row.surfaces for row in plane if row.kind == "power"]
-    made = rt.perturbed(nominal, [T("power", (1,), -1, 1)], [1.0]).surfaces[1]
+    made = rt.tolerancing.perturbed(nominal, [T("power", (1,), -1, 1)], [1.0]).surfaces[1]
     assert abs(0.02 / float(made.curvature) - 1) == pytest.approx(0.6328e-3 / (0.02 * 64), rel=0.02)
 
 
@@ -964,13 +973,16 @@ def test_limits_take_the_place_of_a_grade(nominal):
     assert limits["element_roll", (4, 5)] == (-1.0, 1.0, "degrees")
     row = next(row for row in found if row.kind == "radius")
     assert (row.source, row.distribution) == ("limits radius=0.3%", "uniform")
-    assert rt.perturbed(nominal, found, rt.draw_errors(found, 1)[0]).surfaces[1] is not nominal.surfaces[1]
+    assert (
+        rt.tolerancing.perturbed(nominal, found, rt.tolerancing.draw_errors(found, 1)[0]).surfaces[1]
+        is not nominal.surfaces[1]
+    )
 
 
 def test_limits_alone_and_of_a_file(nominal, tmp_path):
     assert [row.kind for row in rt.tolerances(nominal, "curvature=1e-5")] == ["curvature"] * 5
     lens = rt.read_lens(with_lines(tmp_path, TAIL))
-    read = rt.read_tolerances(tmp_path / "made.zmx")
+    read = rt.tolerancing.read_tolerances(tmp_path / "made.zmx")
     assert [dataclasses.replace(row, source="", group="") for row in rt.tolerances(lens)] == [
         dataclasses.replace(row, source="", group="") for row in read
     ]
@@ -1028,7 +1040,7 @@ def test_errors_go_through_transforms_and_single_precision(asphere):
     close((weights[..., None] * forward).flatten(0, -2).sum(0), slope, 1e-10)
     batch = torch.stack([errors(), errors(-0.5)])
     close(torch.func.vmap(sensor)(batch).transpose(0, 1), sensor(batch), 1e-12)
-    single = rt.perturbed(rt.to(asphere, dtype=torch.float32), rows, batch).surfaces[1:]
+    single = rt.tolerancing.perturbed(rt.to(asphere, dtype=torch.float32), rows, batch).surfaces[1:]
     numbers = [number for surface in single for number in (surface.thickness, surface.curvature) if number is not None]
     assert {number.dtype for number in numbers} == {torch.float32}
 
@@ -1038,7 +1050,9 @@ def sensor_of(lens, rows):
     points = torch.tensor([[0.0, 0.3, -0.8], [0.0, 0.7, -0.4]], dtype=torch.float64)
     fields = torch.tensor([[0.0, 3.0], [0.0, 5.0]], dtype=torch.float64)
     rays = launch(lens, points, fields=fields, wavelengths=lens.wavelengths)
-    return lambda values: trace_lens(rt.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]).position[:2]
+    return lambda values: trace_lens(
+        rt.tolerancing.perturbed(lens, rows, values), rays, lens.wavelengths[:, None]
+    ).position[:2]
 
 
 def test_lines_behind_the_configurations_are_read(tmp_path):
@@ -1051,7 +1065,7 @@ def test_lines_behind_the_configurations_are_read(tmp_path):
     ]
     file = tmp_path / "triplet.zmx"
     file.write_text(source.read_text() + "\n".join(lines) + "\n")
-    found = rt.read_tolerances(file)
+    found = rt.tolerancing.read_tolerances(file)
     assert [row.kind for row in found] == ["thickness"]
     assert [(one.surface, one.parameter, one.maximum) for one in found.compensators] == [(7, "thickness", 1.0)]
     assert not found.unread
@@ -1059,9 +1073,9 @@ def test_lines_behind_the_configurations_are_read(tmp_path):
 
 def test_one_surface_may_move_in_several_ways_alone_and_in_its_element():
     lens = rt.read_lens("cooke_triplet")
-    rows = [rt.Tolerance(f"element_decenter_{axis}", (k, k), -0.1, 0.1) for axis in "xy" for k in (3, 4)]
-    rows += [rt.Tolerance("element_tilt_x", (3, 4), -0.1, 0.1)]
-    moved = rt.perturbed(lens, rows, [0.1, 0.0, 0.05, 0.0, 0.1])
-    single = rt.perturbed(rt.perturbed(lens, rows[4:], [0.1]), rows[:4], [0.1, 0.0, 0.05, 0.0])
+    rows = [rt.system.Tolerance(f"element_decenter_{axis}", (k, k), -0.1, 0.1) for axis in "xy" for k in (3, 4)]
+    rows += [rt.system.Tolerance("element_tilt_x", (3, 4), -0.1, 0.1)]
+    moved = rt.tolerancing.perturbed(lens, rows, [0.1, 0.0, 0.05, 0.0, 0.1])
+    single = rt.tolerancing.perturbed(rt.tolerancing.perturbed(lens, rows[4:], [0.1]), rows[:4], [0.1, 0.0, 0.05, 0.0])
     assert not torch.equal(rt.spot(moved).whole.centroid, rt.spot(lens).whole.centroid)
     assert rt.spot(single).whole.valid.all()

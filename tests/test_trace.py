@@ -13,6 +13,7 @@ from problems import (
     both_engines,
     double_gauss,
     lens,
+    rays_of_problem,
     scalar,
     stigmatic_problems,
     surface,
@@ -26,7 +27,7 @@ from raytrace.maths.sampling import hexapolar
 from raytrace.system.intersection import normal
 from raytrace.system.lens import media
 from raytrace.system.rays import Rays, start
-from raytrace.tracing.launch import launch, rays_from_infinity, rays_from_point
+from raytrace.tracing.launch import launch
 from raytrace.tracing.refraction import reflect, refract
 from raytrace.tracing.trace import axial_path, steps, trace_lens, trace_surfaces
 
@@ -53,18 +54,6 @@ def parallel(heights, dtype=torch.float64) -> Rays:
     heights = torch.as_tensor(heights, dtype=dtype)
     zero = torch.zeros_like(heights)
     return start(torch.stack([zero, heights, zero]), torch.stack([zero, zero, zero + 1]), zero)
-
-
-def rays_of_problem(problem) -> Rays:
-    """Rays through the heights of the problem, turned about z by an angle each, with the path from the source."""
-    height = vector(*problem.heights)
-    angle = torch.arange(len(height), dtype=torch.float64)
-    zero = torch.zeros_like(height)
-    aim = torch.stack([height * torch.cos(angle), height * torch.sin(angle), zero])
-    index = scalar(problem.media[0])
-    if problem.source is None:
-        return rays_from_infinity(torch.stack([zero, zero, zero + 1]), aim, index=index)
-    return rays_from_point(vector(*problem.source)[:, None].expand_as(aim), aim, index=index)
 
 
 @both_engines

@@ -10,35 +10,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from problems_training import fit
 
 import raytrace
-from raytrace.imaging.training import NotFinite, OtherSettings, Run, Share, train
+from raytrace.imaging.training import NotFinite, OtherSettings, Run, Share
 
 #: Where processes started by a test find it and the package.
 PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]
-
-
-def fit(folder, steps, *, every=5, seconds=60.0, stop_at=None, poison=None):
-    """Adam on a small regression whose samples are keyed by their number; returns the weights."""
-    module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()
-    generator = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for p in module.parameters():
-            p.copy_(torch.randn(p.shape, generator=generator, dtype=torch.float64))
-    optimizer = torch.optim.Adam(module.parameters(), 1e-2)
-
-    def loss(step, share):
-        total = torch.zeros((), dtype=torch.float64)
-        for sample in share.of(range(8 * step, 8 * step + 8)):
-            x = torch.randn(3, generator=torch.Generator().manual_seed(sample), dtype=torch.float64)
-            total = total + (module(x) - x.sum()).square().sum() / 8
-        return total * (float("nan") if step == poison else 1.0), {"weight": float(module[0].bias[0].detach())}
-
-    run = Run(folder, {"rate": 1e-2})
-    for step, _ in train(module, optimizer, loss, steps=steps, run=run, every=every, seconds=seconds):
-        if stop_at is not None and step == stop_at:
-            return None
-    return [p.detach().clone() for p in module.parameters()]
 
 
 def test_a_stopped_run_resumes_bit_identically(tmp_path):
@@ -96,12 +74,12 @@ def test_a_killed_process_leaves_a_run_that_resumes(tmp_path):
 
 def test_other_settings_are_refused(tmp_path):
     fit(tmp_path, 3)
-    with pytest.raises(OtherSettings, match=r"rate was 0\.01, now 0\.1; choose another folder"):
+    with pytest.raises(OtherSettings, match=r"rate was 0\.01, now 0\.1; .*another folder"):
         Run(tmp_path, {"rate": 0.1})
 
 
 def test_a_loss_that_is_no_number_stops_the_run_before_the_step(tmp_path):
-    with pytest.raises(NotFinite, match=r"step 7: the loss is nan.*the last checkpoint is .*checkpoint\.pt"):
+    with pytest.raises(NotFinite, match=r"step 7: .*nan.*checkpoint\.pt"):
         fit(tmp_path, 20, poison=7)
     state = Run(tmp_path, {"rate": 1e-2}).load()
     assert state["step"] == 5

@@ -55,7 +55,7 @@ def check_rays(lens, other, tolerance=PM):
     """Rays of both lenses, launched by each, meet the sensor at the same places, mm."""
     ends = []
     for one in (lens, other):
-        rays = launch(one, rt.gauss_rings(2, 5)[0], fields=None)
+        rays = launch(one, rt.maths.gauss_rings(2, 5)[0], fields=None)
         end = trace_lens(one, rays, one.wavelengths[:, None])
         ends.append(torch.cat([end.position, end.direction, end.valid[None].double()]))
     assert ends[0][-1].any()
@@ -65,7 +65,7 @@ def check_rays(lens, other, tolerance=PM):
 def built(name, grade="commercial", trial=0, **conditions):
     lens = rt.read_lens(name).at(**conditions)
     rows = rt.tolerances(lens, grade=grade)
-    return rt.perturbed(lens, rows, rt.draw_errors(rows, 1, 5, first=trial)[0])
+    return rt.tolerancing.perturbed(lens, rows, rt.tolerancing.draw_errors(rows, 1, 5, first=trial)[0])
 
 
 # -- lenses -----------------------------------------------------------------------------------------------------------
@@ -88,18 +88,18 @@ def test_a_perturbed_lens_is_read_back_with_the_same_rays(name, aiming, tmp_path
 
 def test_a_group_inside_which_an_element_and_a_surface_move(tmp_path):
     lens = rt.read_lens("cooke_triplet").at(ray_aiming="real")
-    T = rt.Tolerance
+    T = rt.system.Tolerance
     rows = [T("element_tilt_x", (1, 4), -2, 2), T("element_decenter_y", (1, 2), -1, 1, pivot=3.0)]
     rows += [T("element_tilt_y", (1, 2), -2, 2, pivot=1.5), T("surface_decenter_y", (1,), -1, 1)]
-    made = rt.perturbed(lens, rows, [0.8, 0.3, -0.7, 0.2])
+    made = rt.tolerancing.perturbed(lens, rows, [0.8, 0.3, -0.7, 0.2])
     assert made.surfaces[1].before.z is None
     check_rays(made, again(made, tmp_path))
 
 
 def test_a_shift_of_an_element_is_that_of_the_thicknesses_before_and_behind():
     lens = rt.read_lens("cooke_triplet")
-    shifted = rt.perturbed(lens, [rt.Tolerance("element_decenter_z", (3, 4), -1, 1)], [0.2])
-    moved = rt.perturbed(lens, [rt.Tolerance("thickness", (2,), -1, 1, adjust=4)], [0.2])
+    shifted = rt.tolerancing.perturbed(lens, [rt.system.Tolerance("element_decenter_z", (3, 4), -1, 1)], [0.2])
+    moved = rt.tolerancing.perturbed(lens, [rt.system.Tolerance("thickness", (2,), -1, 1, adjust=4)], [0.2])
     for one, other in zip(shifted.surfaces, moved.surfaces, strict=True):
         assert (one.before, one.after) == (None, None)
         assert float(one.thickness) == pytest.approx(float(other.thickness), abs=1e-14) or one.thickness.isinf()
@@ -145,7 +145,7 @@ def test_a_right_angle_about_y_with_a_decentre_along_z_is_refused(tmp_path):
 def test_the_pose_behind_a_coordinate_break_joins_its_own(tmp_path):
     lens = rt.read_lens("singlet")
     behind = Pose(y=number(-0.1), z=number(0.2), tilt_x=number(-1.0))
-    front = rt.Surface(number(1.0), before=Pose(tilt_x=number(1.0)), after=behind, is_break=True)
+    front = rt.system.Surface(number(1.0), before=Pose(tilt_x=number(1.0)), after=behind, is_break=True)
     lens = dataclasses.replace(lens, surfaces=(*lens.surfaces[:2], front, *lens.surfaces[2:]), ray_aiming="real")
     found = again(lens, tmp_path)
     assert found.surfaces[2].after is None
@@ -218,7 +218,7 @@ def test_a_batch_of_lenses_is_refused(tmp_path):
     for limits in ("index=0.001", "irregularity=1", "radius=1%"):
         rows = rt.tolerances(lens, limits)
         with pytest.raises(LensFileError, match="a file holds one lens"):
-            write_lens(rt.perturbed(lens, rows, rt.draw_errors(rows, 2)), tmp_path / "lens.zmx")
+            write_lens(rt.tolerancing.perturbed(lens, rows, rt.tolerancing.draw_errors(rows, 2)), tmp_path / "lens.zmx")
 
 
 # -- glasses ----------------------------------------------------------------------------------------------------------
@@ -261,11 +261,11 @@ def test_a_medium_of_few_numbers_keeps_its_formula(formula):
 
 def test_a_dispersion_that_no_formula_comes_near_is_refused(tmp_path):
     near = sellmeier([1.3, 0.002], [0.01, 0.15], "POLE")  # a resonance at 0.39 µm
-    with pytest.raises(NoMelt, match=r"POLE with index errors has no melt from 0.4 to 0.7 µm: a formula differs by"):
+    with pytest.raises(NoMelt, match=r"POLE .* no melt from 0.4 to 0.7 µm"):
         melt(with_index_errors(near, number(1e-3)), vector(0.4, 0.7))
     lens = rt.read_lens("singlet").replace(1, glass=near).at(wavelengths=[0.4, 0.7])
-    lens = rt.perturbed(lens, [rt.Tolerance("index", (1,), -1, 1)], [1e-3])
-    with pytest.raises(LensFileError, match=r"surface 1: POLE with index errors has no melt"):
+    lens = rt.tolerancing.perturbed(lens, [rt.system.Tolerance("index", (1,), -1, 1)], [1e-3])
+    with pytest.raises(LensFileError, match=r"surface 1: POLE .* no melt"):
         rt.write_lens(lens, tmp_path / "lens.zmx")
 
 
@@ -276,7 +276,7 @@ INDEX = "index=0.0008 abbe=0.6%"
 def test_melts_lie_in_a_catalog_beside_the_file(name, tmp_path):
     lens = rt.read_lens("double_gauss")
     rows = rt.tolerances(lens, INDEX)
-    made = rt.perturbed(lens, rows, rt.draw_errors(rows, 1)[0])
+    made = rt.tolerancing.perturbed(lens, rows, rt.tolerancing.draw_errors(rows, 1)[0])
     found = again(made, tmp_path, name)
     catalog = "WORST-ONE-3-MELTS" if " " in name else "WORST-MELTS"
     assert sorted(p.name for p in tmp_path.iterdir()) == [*sorted([f"{catalog.lower()}.agf", name])]
@@ -300,7 +300,7 @@ def test_melts_lie_in_a_catalog_beside_the_file(name, tmp_path):
 def test_melts_keep_their_indices_at_another_temperature(tmp_path):
     lens = rt.read_lens("double_gauss").at(temperature=60.0, pressure=0.5)
     rows = rt.tolerances(lens, INDEX)
-    made = rt.perturbed(lens, rows, rt.draw_errors(rows, 1)[0])
+    made = rt.tolerancing.perturbed(lens, rows, rt.tolerancing.draw_errors(rows, 1)[0])
     found = again(made, tmp_path)
     for one, other in zip(made.surfaces, found.surfaces, strict=True):
         indices = (index_in(s.glass, lens.wavelengths, lens.environment) for s in (one, other))
@@ -310,11 +310,11 @@ def test_melts_keep_their_indices_at_another_temperature(tmp_path):
 def test_a_catalog_of_others_is_not_replaced(tmp_path):
     lens = rt.read_lens("double_gauss")
     rows = rt.tolerances(lens, INDEX)
-    made = rt.perturbed(lens, rows, rt.draw_errors(rows, 1)[0])
+    made = rt.tolerancing.perturbed(lens, rows, rt.tolerancing.draw_errors(rows, 1)[0])
     other = tmp_path / "lens-melts.agf"
     text = "CC my glasses\nNM MINE 2 500500 1.5 50 0 0 -1\nCD 1 0.01 0 0 0 0 0 0 0 0\nLD 0.3 2\n"
     other.write_text(text)
-    with pytest.raises(LensFileError, match=r"lens-melts.agf .* another one of that name; give the lens another name"):
+    with pytest.raises(LensFileError, match=r"lens-melts.agf .*give the lens another name"):
         rt.write_lens(made, tmp_path / "lens.zmx")
     assert [p.name for p in tmp_path.iterdir()] == ["lens-melts.agf"]
     assert other.read_text() == text
@@ -327,7 +327,7 @@ def test_a_catalog_of_others_is_not_replaced(tmp_path):
 
 def test_a_sequence_of_code_v_refuses_index_errors(tmp_path):
     lens = rt.read_lens("double_gauss")
-    made = rt.perturbed(lens, [rt.Tolerance("index", (1,), -1, 1)], [1e-3])
+    made = rt.tolerancing.perturbed(lens, [rt.system.Tolerance("index", (1,), -1, 1)], [1e-3])
     with pytest.raises(LensFileError, match="not those of its catalog"):
         rt.write_lens(made, tmp_path / "lens.seq")
 
@@ -339,7 +339,7 @@ def test_numbers_of_configurations_follow_a_shift(tmp_path):
     lens = rt.read_lens("cooke_triplet")
     gap = Operand("THIC", 2, paths=(ScaledPath(("surfaces", 2, "thickness")),), numbers=vector(8.0, 9.0))
     lens = dataclasses.replace(lens, operands=(gap,)).replace(2, thickness=8.0)
-    made = rt.perturbed(lens, [rt.Tolerance("element_decenter_z", (3, 4), -1, 1)], [0.2])
+    made = rt.tolerancing.perturbed(lens, [rt.system.Tolerance("element_decenter_z", (3, 4), -1, 1)], [0.2])
     assert made.operands[0].numbers.tolist() == pytest.approx([8.2, 9.2], abs=1e-14)
     posed = lens.replace(3, before=Pose(z=number(0.2)), after=Pose(z=number(-0.2)))
     for one in (made, posed):
@@ -383,7 +383,7 @@ def test_a_trial_is_the_lens_whose_criterion_the_study_has(study):
         assert lens.optimization_data.variables == lens.optimization_data.solves == ()
         assert lens.notes[-1] == f"As built: trial {k} of seed 0, RMS spot radius {float(study.trials[k]):.6g} µm"
     for k in (-1, 40):
-        with pytest.raises(ValueError, match=f"trial {k}: expected 0 to 39, as 40 were traced"):
+        with pytest.raises(ValueError, match=f"trial {k}: expected 0 to 39"):
             study.trial(k)
 
 

@@ -105,15 +105,17 @@ def test_a_lens_of_torch_save_is_loaded_by_default_in_another_process(tmp_path):
     """With poses, phases, sag terms, apertures, configurations, an environment, variables and a merit function."""
     lens = dataclasses.replace(double_gauss(), notes=("a note",)).with_configurations(thickness={6: [12.0, 16.0]})
     lens = dataclasses.replace(lens, environment=Environment(torch.tensor(40.0), torch.tensor(1.0))).replace(
-        3, tilt_x=1.0, apertures=(rt.Aperture("circular", (0.0, 20.0)),)
+        3, tilt_x=1.0, apertures=(rt.system.Aperture("circular", (0.0, 20.0)),)
     )
     lens = lens.replace(
         5,
-        phase=rt.Grating(frequency=torch.tensor(0.01), order=torch.tensor(1.0)),
+        phase=rt.system.Grating(frequency=torch.tensor(0.01), order=torch.tensor(1.0)),
         sag_terms=TiltSag(torch.tensor(0.1), torch.tensor(0.2)),
     )
-    merit = (rt.Row("EFFL", (0, 1), target=100.0, weight=1.0),)
-    data = OptimizationData((rt.Vary(1, "curvature"),), (Solve(11, "thickness", "marginal_height", (0.0, 0.0)),), merit)
+    merit = (rt.system.Row("EFFL", (0, 1), target=100.0, weight=1.0),)
+    data = OptimizationData(
+        (rt.system.Vary(1, "curvature"),), (Solve(11, "thickness", "marginal_height", (0.0, 0.0)),), merit
+    )
     lens = dataclasses.replace(lens, optimization_data=data)
     torch.save(lens, tmp_path / "lens.pt")
     again = torch.load(tmp_path / "lens.pt")

@@ -63,8 +63,8 @@ def test_pose_and_shape_of_the_image_vary(lens):
     found = design_variables(lens, words)
     assert [name_of(one) for one in found.variables][:4] == ["tilt_x_12", "tilt_y_12", "x_12", "y_12"]
     model = DesignVariables(found.lens, found.variables)
-    rays = [rt.Row(name, (12, 1), (0.3, 1.0, 0.2, 0.5), weight=1.0) for name in ("REAX", "REAY", "REAZ", "RAID")]
-    evaluation = Evaluation(model, [*rays, rt.Row("OPDC", (0, 1), (0.0, 1.0, 0.2, 0.5), weight=1.0)])
+    rays = [rt.system.Row(name, (12, 1), (0.3, 1.0, 0.2, 0.5), weight=1.0) for name in ("REAX", "REAY", "REAZ", "RAID")]
+    evaluation = Evaluation(model, [*rays, rt.system.Row("OPDC", (0, 1), (0.0, 1.0, 0.2, 0.5), weight=1.0)])
     step = 1e-5
     for k, by in enumerate(evaluation(model.start, derivatives=True).jacobian.T):
         ends = [evaluation(model.start + side * step * np.eye(len(model.start))[k]).residuals for side in (1, -1)]
@@ -75,9 +75,11 @@ def test_pose_and_shape_of_the_image_vary(lens):
 def test_the_image_of_a_tilted_lens_follows_scheimpflug():
     """An object at d, a lens tilted by θ: u = d/cos θ along its axis, and tan θ′ = (v/u) tan θ of the image."""
     distance, focal, tilt = 150.0, 50.0, math.radians(10.0)
-    row = dict(curvature=0.0, thickness=70.0, tilt_x=math.degrees(tilt), phase=rt.IdealLens(1 / focal, 1 / focal))
+    row = dict(
+        curvature=0.0, thickness=70.0, tilt_x=math.degrees(tilt), phase=rt.system.IdealLens(1 / focal, 1 / focal)
+    )
     lens = rt.lens([row], stop=1, entrance_pupil_diameter=10.0, object_distance=distance, fields=[-5.0, 5.0])
-    found = rt.optimize(lens, merit=rt.DefaultMerit("spot", rings=1), vary="tilt_x:2 sensor").lens
+    found = rt.optimize(lens, merit=rt.optimization.DefaultMerit("spot", rings=1), vary="tilt_x:2 sensor").lens
     u = distance / math.cos(tilt)
     v = 1 / (1 / focal - 1 / u)
     assert float(found.surfaces[1].thickness) == pytest.approx(v, rel=1e-6)
@@ -89,7 +91,7 @@ def test_the_image_of_a_tilted_lens_follows_scheimpflug():
 
 def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
     """It has the same index, dispersion and partial dispersion, and one warning for each surface says so."""
-    with pytest.warns(VariedGlass, match="varies as a model glass, whose index is off by") as said:
+    with pytest.warns(VariedGlass, match=r"model glass, .* off by") as said:
         found = design_variables(lens, "index abbe_number:3")
     assert len(said) == len(found.variables) - 1 == 6
     model = DesignVariables(found.lens, found.variables)

@@ -164,7 +164,7 @@ def test_a_state_is_of_the_prescription_under_any_conditions_and_in_any_precisio
 def test_a_state_of_an_older_version_is_refused_with_the_way_to_load_it():
     variables = Variables(LENS, "sensor")
     state = {"sensor": torch.tensor(0.25, dtype=torch.float64)}
-    with pytest.raises(OtherLens, match=r"an older version wrote it\. .* set state\['_extra_state'\]"):
+    with pytest.raises(OtherLens, match=r"older version.* set state\['_extra_state'\]"):
         variables.load_state_dict(state)
     variables.load_state_dict(state | {"_extra_state": variables.get_extra_state()})
     assert float(variables.sensor) == 0.25
@@ -201,7 +201,7 @@ def test_bounds_hold_after_a_step():
     numbers = variables.numbers()
     assert numbers["sensor"] == pytest.approx(58.0, abs=NANOMETRE)
     assert numbers["curvature_3"] == pytest.approx(0.0, abs=1e-12)
-    with pytest.raises(BadVariables, match="`bounds` for thickness_2, not among the variables"):
+    with pytest.raises(BadVariables, match="`bounds` for thickness_2, not among"):
         Variables(read_lens("double_gauss"), "sensor", bounds={"thickness_2": (0, 1)})
 
 
@@ -425,7 +425,7 @@ def test_variable_syntax_is_that_of_optimize():
 
 def test_variables_and_words_may_be_given_together():
     lens = rt.read_lens("cooke_triplet")
-    free = design_variables(lens, [rt.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
+    free = design_variables(lens, [rt.system.Vary(1, "curvature", bounds=(0.01, 0.05)), "conic:3 thickness:2"])
     assert [(one.surface, one.quantity) for one in free.variables] == [(1, "curvature"), (3, "conic"), (2, "thickness")]
     assert free.variables[0].bounds == (0.01, 0.05)
     assert float(free.lens.surfaces[3].conic) == 0

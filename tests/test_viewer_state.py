@@ -466,7 +466,7 @@ def test_variables_of_an_optimised_lens_and_new_ones_vary_together(triplet):
 @pytest.mark.parametrize("weight", [-1.0, 1.0])
 def test_an_optimisation_keeps_what_the_file_requires(triplet, weight, tmp_path):
     """A chosen merit function replaces the image's rows of the file; a focal length that the file asks for remains."""
-    rows = (rt.Row("EFFL", (0, 2), target=100.0, weight=weight * 10), *rt.Merit.default(triplet, rings=2).rows)
+    rows = (rt.system.Row("EFFL", (0, 2), target=100.0, weight=weight * 10), *rt.Merit.default(triplet, rings=2).rows)
     data = OptimizationData(tuple(Vary(k, "curvature") for k in (1, 2, 3, 4, 6, 7)), merit=rows)
     rt.write_lens(dataclasses.replace(triplet, optimization_data=data), tmp_path / "held.zmx")
     session = Session(rt.read_lens(tmp_path / "held.zmx"))
@@ -481,7 +481,7 @@ def test_an_optimisation_keeps_what_the_file_requires(triplet, weight, tmp_path)
 
 def test_a_file_of_conditions_alone_is_optimised_for_its_spots(triplet):
     data = OptimizationData(
-        (Vary(1, "curvature"), Vary(4, "curvature")), merit=(rt.Row("EFFL", target=100, weight=-1),)
+        (Vary(1, "curvature"), Vary(4, "curvature")), merit=(rt.system.Row("EFFL", target=100, weight=-1),)
     )
     session = Session(dataclasses.replace(triplet, optimization_data=data))
     assert session.state.merit == "spot"

@@ -260,7 +260,7 @@ def test_files_of_one_name_are_refused(tmp_path):
     words = ["-o", str(tmp_path / "run"), "--elements"]
     with pytest.raises(CommandError, match=r"both would be learned-0\.01"):
         noise.main([*words, LEARNED, f"{tmp_path}/learned-0.01.json"])
-    with pytest.raises(CommandError, match="fresnel is the row 'Fresnel lens'; give the file another name"):
+    with pytest.raises(CommandError, match="'Fresnel lens'; give the file another name"):
         noise.main([*words, str(tmp_path / "fresnel.npy")])
 
 

@@ -76,12 +76,12 @@ def test_true_spheres_are_met_by_the_series(radius, sensor, focus):
     [("radius", 0.0), ("sensor", -1.0), ("focus", math.nan), ("wavelength", 0.0), ("sensor", math.inf)],
 )
 def test_numbers_that_make_no_camera_are_refused(name, wrong):
-    with pytest.raises(ValueError, match=f"the {name} is .* expected a positive number"):
+    with pytest.raises(ValueError, match=f"{name} .*expected a positive number"):
         aim(**{name: wrong})
 
 
 def test_spheres_too_steep_for_a_series_are_refused():
-    with pytest.raises(ValueError, match="a sphere around a point 3 mm away is too steep"):
+    with pytest.raises(ValueError, match=r"3 mm .*too steep"):
         converging(aim(sensor=3.0, radius=2.9, exact=True))
     assert len(converging(aim(sensor=3.0, radius=2.9))) == 1
 
@@ -90,7 +90,7 @@ def test_spheres_too_steep_for_a_series_are_refused():
 
 
 def test_a_name_that_is_no_baseline_is_refused_with_the_list():
-    with pytest.raises(ValueError, match="'kubic'; expected one of ideal, singlet, fresnel"):
+    with pytest.raises(ValueError, match=r"'kubic'; .*ideal, singlet, fresnel"):
         baseline("kubic", aim())
     with pytest.raises(TypeError):
         baseline("ideal", aim(), levels=16)

@@ -118,14 +118,14 @@ def test_fabricated_is_the_same_element_with_its_heights_written_out():
 @pytest.mark.parametrize("suffix", [".npy", ".csv", ".tif"])
 def test_files_hold_the_simulated_kernels(tmp_path, suffix, levels):
     """Heights wrapped and in steps, of rings and of pixels made of them: the file alone is the element, no period."""
-    rings = rt.as_rings(lens(), 0.02)
-    rt.write_element(rings, tmp_path / f"whole{suffix}", design_wavelength=0.55)
-    read = rt.read_element(tmp_path / f"whole{suffix}", aperture=1.0, design_wavelength=0.55, levels=levels)
+    rings = rt.wave_optics.as_rings(lens(), 0.02)
+    rt.wave_optics.write_element(rings, tmp_path / f"whole{suffix}", design_wavelength=0.55)
+    read = rt.wave_optics.read_element(tmp_path / f"whole{suffix}", aperture=1.0, design_wavelength=0.55, levels=levels)
     assert float(read.numbers.abs().max()) > 4 * float(read.period)  # whole heights, wrapped when they are used
-    for name, element in (("rings", read), ("pixels", rt.as_pixels(read, 0.02))):
+    for name, element in (("rings", read), ("pixels", rt.wave_optics.as_pixels(read, 0.02))):
         file = tmp_path / f"{name}{suffix}"
-        rt.write_element(element, file, design_wavelength=0.55)
-        again = rt.read_element(file, aperture=1.0)
+        rt.wave_optics.write_element(element, file, design_wavelength=0.55)
+        again = rt.wave_optics.read_element(file, aperture=1.0)
         x = torch.linspace(-0.35, 0.35, 57, dtype=torch.float64)
         # A picture of 16 bits has its range in 65,535 steps, rounded to the nearest; steps come back bit for bit.
         most = 0.0 if levels or suffix != ".tif" else float(read.period) / 131_070 * 1.001

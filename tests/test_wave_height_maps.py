@@ -289,7 +289,7 @@ def test_every_cut_file_is_refused_or_whole(suffix, tmp_path):
 def test_pictures_of_8_bits_and_in_colour_are_refused(tmp_path):
     for mode in ("L", "RGB"):
         Image.new(mode, (4, 4)).save(tmp_path / "map.png")
-        with pytest.raises(HeightMapError, match=f"mode {mode}; expected grey values of 16 bits"):
+        with pytest.raises(HeightMapError, match=f"mode {mode}; expected .*16 bits"):
             read_heights(tmp_path / "map.png", span=(0.0, 1.0), pitch=1.0)
 
 
@@ -341,5 +341,5 @@ def test_a_changed_picture_does_not_get_another_ones_heights(tmp_path):
     stream = io.BytesIO()
     Image.fromarray(np.array([[0, 7], [9, 0]], np.uint16)).save(stream, "TIFF", tiffinfo={270: text})
     (tmp_path / "map.tif").write_bytes(stream.getvalue())
-    with pytest.raises(HeightMapError, match="has 3 grey values, but its description lists 2"):
+    with pytest.raises(HeightMapError, match=r"3 grey values, .* lists 2"):
         read_heights(tmp_path / "map.tif")

@@ -10,14 +10,13 @@ from scripts import script
 from raytrace.cli import build_parser
 from raytrace.cli.settings import words as words_of
 from raytrace.cli.wave_design import NANOMETRE, ROWS
-from raytrace.experiments import published
 from raytrace.imaging.wave_camera import FILTERS, WaveCameraConfig
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import aim, baseline
 
 edof, noise = script("wave_edof"), script("wave_noise")
 Content, Gains, Interval, OverNoise, Score = edof.Content, noise.Gains, noise.Interval, noise.OverNoise, noise.Score
-Noise = noise.Settings
+Noise, published = noise.Settings, script("experiments").published
 
 
 def taken(name: str, words: str) -> argparse.Namespace:

@@ -7,7 +7,7 @@ import warnings
 import pytest
 import torch
 from problems import scalar, vector
-from test_wave_propagation import PLASTIC, R, lens, relative, scene
+from problems_waves import PLASTIC, R, lens, relative, scene
 
 from raytrace.psf_models.dft import Aliased, integrate
 from raytrace.wave_optics import pupil

@@ -8,7 +8,7 @@ import warnings
 import pytest
 import torch
 from problems import scalar
-from test_wave_propagation import PLASTIC, R, lens, relative, scene
+from problems_waves import PLASTIC, R, lens, relative, scene
 
 from raytrace.psf_models.dft import integrate, phasor, sub_pixels
 from raytrace.wave_optics import mixed, propagation

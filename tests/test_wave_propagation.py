@@ -8,6 +8,7 @@ import pytest
 import rayleigh
 import torch
 from problems import scalar, vector
+from problems_waves import PLASTIC, R, Z, lens, relative, scene
 
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import constant, index
@@ -18,24 +19,7 @@ from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave_optics.scene import WaveScene, excess
 
-R, Z = 2.5, 35.5  # mm
 WAVELENGTHS = (0.46, 0.55, 0.64)
-PLASTIC = constant(2.0)  # a path of the height itself
-
-
-def lens(focus=1000.0, *, radius=R, distance=Z, exact=False, glass=PLASTIC, extra=0.0):
-    """Focuses a point at `focus` mm onto the sensor; extra: mm of defocus at the rim."""
-    a, b = 1 / focus, 1 / distance
-    powers = [-(a + b) / 2 + extra / radius**2]
-    if exact:  # the series of both spheres, the next term is 1e-12 mm
-        powers += [(a**3 + b**3) / 8, -(a**5 + b**5) / 16, 5 * (a**7 + b**7) / 128, -7 * (a**9 + b**9) / 256]
-    return Element(EvenPowers(vector(*powers)), scalar(radius), glass)
-
-
-def scene(*elements, depths=(1000.0,), wavelengths=(0.55,), size=32, pitch=0.00369, centre=(0.0, 0.0), exact=False):
-    elements = elements or (lens(exact=exact),)
-    window = grid(scalar(pitch), size, vector(*centre))
-    return WaveScene(elements, scalar(Z), vector(*depths), vector(*wavelengths), window, exact)
 
 
 def density(s, x, y, samples=256):
@@ -56,11 +40,6 @@ def along_x(s, x, samples=256):
     across = pupil.waves_at(torch.zeros(1, dtype=x.dtype), t, wavelength)
     unfolded = pupil.ToPixels(pupil.waves_at(x, t, wavelength), across, sums.to_pixels.pixel)
     return pupil.intensity(s, dataclasses.replace(sums, to_pixels=unfolded))[..., 0, :]
-
-
-def relative(result, expected):
-    """Largest relative L2 error of the kernels."""
-    return float(((result - expected).flatten(2).norm(dim=-1) / expected.flatten(2).norm(dim=-1)).max())
 
 
 @pytest.mark.parametrize("exact", [False, True])

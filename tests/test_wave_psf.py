@@ -7,7 +7,7 @@ import pytest
 import torch
 from differences import gradcheck
 from problems import scalar, vector
-from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
+from problems_waves import PLASTIC, R, Z, lens, relative, scene
 
 import raytrace as rt
 from raytrace.materials.catalogs import find_glass
@@ -220,11 +220,11 @@ def test_a_memo_of_the_pupil_engine(kind):
 def test_kernels_one_by_one_are_those_at_once_and_share_the_light_behind_the_pixels(monkeypatch, size):
     element = plate("pixels")
     options = {"sensor": float(Z), "depths": [500.0, 1000.0, math.inf], "wavelengths": [0.46, 0.55], "size": size}
-    at_once = rt.wave_psf(element, **options)
+    at_once = rt.wave_optics.wave_psf(element, **options)
     monkeypatch.setattr(compute, "_CHUNK", 0.0)
     made, behind = [], pupil.behind_pixels
     monkeypatch.setattr(pupil, "behind_pixels", lambda *scene: made.append(scene) or behind(*scene))
-    alone = rt.wave_psf(element, **options)
+    alone = rt.wave_optics.wave_psf(element, **options)
     assert len(made) == 2  # of the wavelengths
     assert relative(alone.kernel, at_once.kernel) < 1e-14
     assert (alone.axial is None) == (size == 7)

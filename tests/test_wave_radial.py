@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from problems import scalar, vector
-from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
+from problems_waves import PLASTIC, R, Z, lens, relative, scene
 
 from raytrace.psf_models.dft import bessel_j0, bessel_j1
 from raytrace.tracing.scene import Memo

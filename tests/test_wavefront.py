@@ -4,8 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from problems import double_gauss, lens, scalar, stigmatic_problems, surface, vector
-from test_trace import rays_of_problem
+from problems import double_gauss, lens, rays_of_problem, scalar, stigmatic_problems, surface, vector
 
 from raytrace.maths.sampling import hexapolar
 from raytrace.system.lens import media

@@ -244,8 +244,8 @@ def test_a_small_part_of_the_pupil_gives_no_coefficients():
 
 def test_coefficients_of_a_beam_that_fills_too_little_of_the_pupil_are_nan_with_a_warning():
     lens = rt.read_lens("cooke_triplet")
-    lens = lens.replace(lens.stop, apertures=(rt.Aperture("circular", (0.0, 1.5)),))
-    with pytest.warns(rt.Incomplete, match="field 0 degrees: the light fills too little of the entrance pupil"):
+    lens = lens.replace(lens.stop, apertures=(rt.system.Aperture("circular", (0.0, 1.5)),))
+    with pytest.warns(rt.Incomplete, match=r"field 0 degrees: .*too little .*pupil"):
         found = rt.wavefront(lens, fields=[0], wavelengths=[0.55])
     assert bool(found.coefficients.isnan().all())
     assert bool(found.rms.isfinite().all())

@@ -5,49 +5,12 @@ import math
 import re
 
 import pytest
+from problems_zemax import file, lens, read
 
-from raytrace.io import FORMATS, LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens
+from raytrace.io import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens
 from raytrace.io.source import Place, decode
 from raytrace.materials.catalogs import UnknownGlass, find_glass
 from raytrace.materials.glass import MIRROR, mil_glass
-
-HEAD = {
-    "MODE": "MODE SEQ",
-    "NAME": "NAME A singlet",
-    "UNIT": "UNIT MM X W X CM MR CPMM",
-    "APERTURE": "ENPD 10",
-    "GCAT": "GCAT SCHOTT",
-    "FTYP": "FTYP 0 0 2 2 0 0 0",
-    "X": "XFLN 0 0 0 0 0 0 0 0 0 0 0 0",
-    "Y": "YFLN 0 7 0 0 0 0 0 0 0 0 0 0",
-    "W1": "WAVM 1 0.4861327 1",
-    "W2": "WAVM 2 0.5875618 0.5",
-    "W3": "WAVM 3 0.55 1",
-    "PWAV": "PWAV 2",
-}
-
-
-def file(*, surface: str = "", stop: str = "", object_: str = "", tail: str = "", **head: str) -> str:
-    """A singlet of three surfaces between object and image; header lines replaced, lines of surfaces added."""
-    lines = [line for line in (HEAD | head).values() if line]
-    lines += ["SURF 0", "  TYPE STANDARD", "  CURV 0.0", "  DISZ INFINITY", *_indented(object_)]
-    lines += ["SURF 1", "  TYPE STANDARD", "  CURV 0.02 0 0 0 0", "  DISZ 4", "  GLAS N-BK7 0 0 1.5 40", "  DIAM 6"]
-    lines += _indented(surface)
-    lines += ["SURF 2", "  STOP", "  TYPE STANDARD", "  CURV -0.02", "  DISZ 47.5", "  DIAM 5.5", *_indented(stop)]
-    lines += ["SURF 3", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0", *tail.splitlines()]
-    return "\n".join(lines) + "\n"
-
-
-def _indented(text: str) -> list[str]:
-    return [f"  {line}" for line in text.splitlines()]
-
-
-def read(text: str, **options):
-    return FORMATS[".zmx"].read(text, "lens.zmx", **options)
-
-
-def lens(**changes):
-    return read(file(**changes))[0]
 
 
 def test_a_singlet_is_read_number_for_number():
@@ -230,7 +193,7 @@ def test_ray_aiming_is_the_second_number_of_raim(number, kind, tmp_path):
 
 
 def test_ray_aiming_of_another_kind_is_refused():
-    with pytest.raises(LensFileError, match=r"RAIM of kind 3, expected 0 \(off\), 1 \(paraxial\) or 2 \(real\)"):
+    with pytest.raises(LensFileError, match=r"RAIM .*3, expected 0 .*, 1 .* or 2"):
         lens(PWAV="PWAV 1\nRAIM 0 3 1 1")
 
 
@@ -353,7 +316,7 @@ def test_report_sorts_every_keyword():
     assert "unknown" in str(report)
     assert "surface 1: N-BK7, SCHOTT" in str(report)
     assert json.loads(json.dumps(report.document()))["keywords"][0]["count"] == 1
-    with pytest.raises(LensFileError, match=r"unknown keyword .* \(and 1 more warning\)"):
+    with pytest.raises(LensFileError, match=r"unknown keyword .*1 more"):
         read(text, strict=True)
 
 

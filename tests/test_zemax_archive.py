@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_catalogs import SMALL
-from test_zemax import file as singlet
+from problems_zemax import SMALL, archive, bits, header, lzw
+from problems_zemax import file as singlet
 
 from raytrace import check
 from raytrace.cli import main
@@ -30,45 +30,6 @@ def no_catalogs_from_the_environment(monkeypatch):
 
 
 # -- a packer of our own ----------------------------------------------------------------------------------------------
-
-
-def lzw(content: bytes) -> bytes:
-    """The codes of LZW, of 9 bits and more, the highest bit first, padded with zeros to whole bytes."""
-    words, codes, before = {bytes([k]): k for k in range(256)}, [], b""
-    for k in range(len(content)):
-        longer = before + content[k : k + 1]
-        if longer not in words:
-            codes.append(words[before])
-            words[longer] = len(words)
-            longer = content[k : k + 1]
-        before = longer
-    return bits([*codes, *([words[before]] if before else [])])
-
-
-def bits(codes: list[int]) -> bytes:
-    """Codes as bits: code k, from 0, has as many as the dictionary of its reader then needs."""
-    text = "".join(f"{code:0{(255 + max(k, 1)).bit_length()}b}" for k, code in enumerate(codes))
-    return int(text.ljust(-(-len(text) // 8) * 8, "0") or "0", 2).to_bytes(-(-len(text) // 8), "big")
-
-
-def header(name: str, size: int, version: int) -> bytes:
-    if version == 0xEA:
-        head = bytearray(0x14C)
-        head[0x0C:0x10], head[0x20 : 0x20 + len(name)] = size.to_bytes(4, "little"), name.encode("latin-1")
-    else:
-        head = bytearray(0x288)
-        head[0x10:0x18], head[0x30 : 0x30 + 2 * len(name)] = size.to_bytes(8, "little"), name.encode("utf-16-le")
-    head[0] = version
-    return bytes(head)
-
-
-def archive(files: dict[str, str | bytes], version: int = 0xEC, packed: bool = True) -> bytes:
-    parts = []
-    for name, content in files.items():
-        content = content if isinstance(content, bytes) else content.encode("utf-16")
-        content, name = (lzw(content), f"{name}.LZW") if packed else (content, name)
-        parts += [header(name, len(content), version), content]
-    return b"".join(parts)
 
 
 def written(folder: Path, files: dict, name: str = "lens.zar", **kind) -> Path:
@@ -167,13 +128,13 @@ def test_info_of_an_archive_is_that_of_its_lens(tmp_path, capsys):
 
 
 def test_an_archive_is_not_written(tmp_path):
-    with pytest.raises(LensFileError, match=r"a \.zar file is read, but not written; expected one of \.zmx"):
+    with pytest.raises(LensFileError, match=r"\.zar .*not written; expected .*\.zmx"):
         convert("double_gauss", tmp_path / "lens.zar")
 
 
 def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
     path = written(tmp_path, {"A.ZMX": singlet(surface="CONI x")})
-    with pytest.raises(LensFileError, match=r"lens\.zar \(A\.ZMX\):23, surface 1: CONI: conic constant is 'x'"):
+    with pytest.raises(LensFileError, match=r"lens\.zar \(A\.ZMX\):23, surface 1: .*'x'"):
         read_lens(path)
 
 
@@ -181,9 +142,9 @@ def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
 
 
 def test_an_archive_without_a_lens_lists_its_members(tmp_path):
-    with pytest.raises(LensFileError, match=r"no lens \(\.zmx\) among its 2 members \(A\.CFG, B\.AGF\)"):
+    with pytest.raises(LensFileError, match=r"no lens .* 2 members \(A\.CFG, B\.AGF\)"):
         read_lens(written(tmp_path, {"A.CFG": b"", "B.AGF": SMALL}))
-    with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\), none with its own name"):
+    with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\)"):
         read_lens(written(tmp_path, {"A.ZMX": singlet(), "B.ZMX": singlet()}))
 
 
@@ -336,7 +297,7 @@ def test_a_lens_is_written_with_its_catalog_and_read_again(tmp_path):
     elsewhere.mkdir()
     with (
         pytest.warns(UserWarning, match="its index differs"),
-        pytest.raises(LensFileError, match="put its catalog into the folder of the file"),
+        pytest.raises(LensFileError, match="catalog into the folder of the file"),
     ):
         convert(path, elsewhere / "again.zmx")
     assert not any(elsewhere.iterdir())
@@ -358,7 +319,7 @@ def test_many_large_catalogs_are_bounded_together_and_parsed_where_glasses_are_a
 def test_a_catalog_of_too_many_glasses_is_refused():
     text = "".join(f"NM G{k} 2 0 1.5 60\n" for k in range(MOST_GLASSES + 1))
     for read in (parse_agf, listed):
-        with pytest.raises(CatalogError, match=f"{MOST_GLASSES + 1} glasses, more than any catalog"):
+        with pytest.raises(CatalogError, match=f"{MOST_GLASSES + 1} glasses"):
             read(text, "many.agf")
 
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments import Store
 
 import raytrace as rt
 from raytrace.analysis.layout import draw_layout, on_one_scale
-from raytrace.experiments import Store
 from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.plotting.style import new_figure, save
 from raytrace.tolerancing.as_built import AsBuiltTerm

@@ -53,9 +53,7 @@ def main(device: str) -> None:
     for name, jobs in cases.items():
         results = {where: job()[0].cpu() for where, job in jobs.items()}
         error = (results[device] - results["cpu"]).abs().max() / results["cpu"].abs().max()
-        seconds = in_turns(
-            {where: (job, lambda: None) for where, job in jobs.items()}, repeats=5, threads=torch.get_num_threads()
-        )
+        seconds = in_turns(jobs, repeats=5, threads=torch.get_num_threads())
         middle = {where: 1e3 * statistics.median(times) for where, times in seconds.items()}
         print(
             f"{name}: CPU {middle['cpu']:.1f} ms, {device} {middle[device]:.1f} ms, difference {error:.1e}", flush=True

@@ -32,12 +32,12 @@ from optiland.optic import Optic
 from optiland.optimization import LeastSquares, OptimizationProblem, TorchAdamOptimizer
 from optiland.optimization.operand.operand import operand_registry
 from optiland.samples.objectives import CookeTriplet, DoubleGauss
+from pages import digits, listing
 from torch import Tensor
 
 from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.sampling import gauss_legendre
 from raytrace.optimization.optimize import optimize
-from raytrace.pages import digits, listing
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.surface import Surface

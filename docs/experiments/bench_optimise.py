@@ -20,16 +20,16 @@ from pathlib import Path
 
 import bench_kit as kit
 import numpy as np
+from bench_kit import Page, Request, in_words
 from matplotlib.figure import Figure
+from pages import digits, listing
 
-from raytrace.bench.report import Measured, Request, in_words
 from raytrace.cli.progress import progress
 from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
 from raytrace.optimization.variables import DesignVariables, design_variables, name_of
-from raytrace.pages import digits, listing
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
@@ -60,7 +60,7 @@ class FileRow:
     stopped: str
 
 
-def bench(request: Request) -> Measured:
+def bench(request: Request) -> Page:
     """The files, and the Jacobian of a default merit function."""
     prepare()
     files = request.arguments.lenses
@@ -78,7 +78,7 @@ def bench(request: Request) -> Measured:
         f"{1e3 * whole:.2f} ms, {whole / forward:.1f} times as much.",
     ]  # fmt: skip
     document = {"about": about, "forward_s": forward, "jacobian_s": whole}
-    return Measured(rows, lines, document, optimise_figure, ("optimise.md", "optimise"))
+    return Page(rows, lines, document, optimise_figure, ("optimise.md", "optimise"))
 
 
 def _of_file(name: str, bar) -> FileRow:

@@ -1,4 +1,4 @@
-"""Speed of PSFs against their error: `raytrace bench psf` with random rays, direct sums and targets in addition.
+"""Speed of PSFs against their error: `raytrace bench psf` with peers, Sobol and random rays, direct sums and targets.
 
     python docs/experiments/bench_psf.py --docs FOLDER
 
@@ -11,23 +11,47 @@ import dataclasses
 import functools
 import math
 import sys
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import bench_kit as kit
 import torch
+from bench_figures import psf_figure
+from bench_kit import Page, Request, in_words
+from pages import listing, milliseconds, yes
 
-from raytrace.bench import psf
 from raytrace.bench.measure import clock
-from raytrace.bench.psf import Method, PsfRow, Truth, bounds, bounds_closely, errors_of, relative_l1, row_of
-from raytrace.bench.report import Measured, Request, in_words
+from raytrace.bench.psf import (
+    Case,
+    Method,
+    PsfRow,
+    Truth,
+    cases,
+    errors_of,
+    measured_rows,
+    methods,
+    relative_l1,
+    row_of,
+    truth_of,
+)
+from raytrace.cli.progress import progress
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid, random
-from raytrace.pages import listing, milliseconds, yes
-from raytrace.psf_models import drt
-from raytrace.psf_models.direct_sum import Sampling, direct_sum
+from raytrace.psf_models import MODELS, NotConverged, drt
+from raytrace.psf_models.direct_sum import Sampling, direct_sum, sampling_of
 from raytrace.psf_models.result import Kernels
+from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 
+#: Field angles in degrees, object distance in mm (None: that of the lens) and pixel pitch in mm of the published cases.
+USUAL = {
+    "double_gauss": ((0.0, 14.0), 1e4, 0.005),
+    "phone": ((0.0,), None, 0.001),
+    "hubble": ((0.0,), None, 0.005),
+}
+FINEST_WAVE = 3  # order of the wave model that its estimates are compared with
+SOBOL = (256, 4096)
 RANDOM, DIRECT = "random rays", "direct sum"
 RAYS_ERROR, WAVE_ERROR = 0.01, 1e-3  # of random rays and of direct sums
 GAUSSIAN_ERROR = 1e-6  # of σ and of the centroid
@@ -38,6 +62,65 @@ PILOT = 2**17  # random rays whose error predicts how many are needed
 PATIENCE = 20.0  # s: longer runs are extrapolated
 LADDER = ((0.65, -1), (0.75, -1), (0.75, 0))  # parts of the wave model's rings and arms, added nodes; cheapest first
 SQUARE = (64, 96)  # points across the square pupil grids that are run
+
+
+@dataclasses.dataclass(frozen=True)
+class Row(PsfRow):
+    """own_error: the error that `estimate` bounds, against the finest order of the model (`gaussian`: of σ and energy,
+    else of the kernel); extrapolated: from runs with fewer rays."""
+
+    own_error: float | None = None
+    extrapolated: bool = False
+
+
+def published_cases(name: str, lens: Lens) -> list[Case]:
+    """Those of USUAL, other lenses as `raytrace bench psf` has them."""
+    if name not in USUAL:
+        return cases(name, lens)
+    fields, distance, pitch = USUAL[name]
+    distance = float(lens.surfaces[0].thickness) if distance is None else distance
+    return [Case(lens, name, field, distance, pitch) for field in fields]
+
+
+def all_methods() -> list[Method]:
+    """Those of `raytrace bench psf`, and Sobol rays."""
+    sobol = [
+        Method("Sobol rays", f"{rays} rays", functools.partial(drt.kernels_of_rays, rays=rays), "rays")
+        for rays in SOBOL
+    ]
+    return methods() + sobol
+
+
+def estimated_rows(truth: Truth, rows: Sequence[PsfRow]) -> list[Row]:
+    """The rows, those with an estimate with the true error."""
+    by_name, extended = {(method.model, method.sampling): method for method in methods()}, []
+    finest = functools.cache(lambda: MODELS["wave"].kernels(truth.case.scene, truth.windows["wave"], order=FINEST_WAVE))
+    for row in rows:
+        error = None
+        if row.estimate is not None:
+            dtype, method = getattr(torch, row.dtype), by_name[row.model, row.sampling]
+            with warnings.catch_warnings(), torch.no_grad():
+                warnings.simplefilter("ignore", NotConverged)
+                result = method.run(to(truth.case.scene, dtype=dtype), to(truth.windows[row.against], dtype=dtype))
+                kernel = result.kernel.double().reshape(result.kernel.shape[-2:])
+                exact = finest().kernel[0, 0, 0] if row.against == "wave" else truth.kernels[row.against]
+            error = relative_l1(kernel, exact)
+            if row.against == "gaussian":
+                variance, energy = truth.sigma**2, float(exact.sum())
+                excess = result.covariance.double().reshape(3)[::2] - variance
+                error = max(float(0.5 * excess.abs().sum() / variance.sum()), abs(float(kernel.sum()) / energy - 1))
+        extended.append(Row(**dataclasses.asdict(row), own_error=error))
+    return extended
+
+
+def bounds(row: Row) -> bool:
+    """Whether the estimate bounds the error."""
+    return row.own_error <= row.estimate
+
+
+def bounds_closely(row: Row) -> bool:
+    """Whether it does so within a factor of 10."""
+    return row.own_error <= row.estimate <= 10 * row.own_error
 
 
 def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int = PIECE, seed: int = 0) -> Kernels:
@@ -53,18 +136,18 @@ def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int = PIECE
     return Kernels(kernel, grid, centroid, covariance, count)
 
 
-def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[PsfRow]:
+def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[Row]:
     """Random rays: some thousands, and as many as bring the histogram to RAYS_ERROR (error ∝ rays^-1/2)."""
     scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows["rays"], dtype=dtype)
 
     @torch.no_grad()
-    def run(count: int) -> PsfRow:
+    def run(count: int) -> Row:
         now = clock(threads)
         start = now()
         result = random_histogram(scene, grid, count)
         seconds = now() - start
         method = Method(RANDOM, f"{count:,} rays", random_histogram, "rays")
-        return row_of(truth, method, dtype, count, forward_s=seconds, **errors_of(truth, "rays", result))
+        return Row(**vars(row_of(truth, method, dtype, count, forward_s=seconds, **errors_of(truth, "rays", result))))
 
     run(1000)  # fills caches
     rows = [run(1000), run(10_000), run(PILOT)]
@@ -80,24 +163,25 @@ def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[PsfRow]:
     return rows
 
 
-def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
+def direct_rows(truth: Truth, threads: int) -> list[Row]:
     """Direct sums over Gauss rings, up to the cheapest that meets WAVE_ERROR, and over square grids, extrapolated.
 
     The error of a square grid, of its ragged rim, falls with a power of the number of rays.
     """
     window, rows = truth.windows["wave"], []
+    first = sampling_of(truth.case.scene, window)
 
-    def run(sampling: Sampling) -> PsfRow:
+    def run(sampling: Sampling) -> Row:
         now = clock(threads)
         start = now()
         kernel, count = direct_sum(truth.case.scene, window, sampling)
         seconds = now() - start
         method = Method(f"{DIRECT}, {'rings' if sampling.arms else 'grid'}", str(sampling), direct_sum, "wave")
         l1 = relative_l1(kernel, truth.kernels["wave"])
-        return row_of(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)
+        return Row(**vars(row_of(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)))
 
     for part, more in LADDER:
-        sampling = truth.sampling.scaled(part, more)
+        sampling = first.scaled(part, more)
         rows.append(run(sampling))
         if rows[-1].l1_error <= WAVE_ERROR:
             break
@@ -110,7 +194,7 @@ def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
     return rows
 
 
-def _extrapolated(row: PsfRow, rays: int, error: float) -> PsfRow:
+def _extrapolated(row: Row, rays: int, error: float) -> Row:
     """With as many rays as the error needs, and time in proportion to them."""
     sampling = f"{rays:,} rays" if row.model == RANDOM else f"{round(math.sqrt(4 * rays / math.pi))}² grid"
     errors = {"l1_error": error, "sigma_error": None, "centroid_error": None, "model_error": None}
@@ -118,10 +202,15 @@ def _extrapolated(row: PsfRow, rays: int, error: float) -> PsfRow:
     return dataclasses.replace(row, sampling=sampling, rays=rays, forward_s=seconds, extrapolated=True, **errors)
 
 
-def more(truth: Truth, threads: int) -> list[PsfRow]:
-    """Random rays and direct sums of a case."""
-    rows = [row for dtype in (torch.float64, torch.float32) for row in random_rows(truth, dtype, threads)]
-    return rows + (direct_rows(truth, threads) if "wave" in truth.kernels else [])
+def rows_of(case: Case, request: Request, bar) -> list[Row]:
+    """Every method and peer, random rays and direct sums of a case."""
+    truth, threads, dtypes = truth_of(case, bar.write), request.threads, (torch.float64, torch.float32)
+    tasks = [(method, dtype) for method in all_methods() for dtype in dtypes]
+    tasks += [(method, torch.float64) for method in request.peers.psf_methods(truth)] if request.peers else []
+    rows = measured_rows(truth, tasks, request.arguments.repeats, threads, say=bar.write)
+    bar.update(1)
+    extended = estimated_rows(truth, rows) + [row for dtype in dtypes for row in random_rows(truth, dtype, threads)]
+    return extended + (direct_rows(truth, threads) if "wave" in truth.kernels else [])
 
 
 # -- targets -----------------------------------------------------------------------------------------------------------
@@ -131,7 +220,7 @@ def _power(number: float) -> str:
     return f"{number:.0e}".replace("e-0", "e-")
 
 
-def targets(rows: Sequence[PsfRow]) -> list[tuple[str, str, str, bool]]:
+def targets(rows: Sequence[Row]) -> list[tuple[str, str, str, bool]]:
     """Target, case, measurement, and whether it is met: in float64, the estimates also in float32."""
     double, single = ([row for row in rows if row.dtype == dtype] for dtype in ("float64", "float32"))
     goals = []
@@ -150,8 +239,8 @@ def targets(rows: Sequence[PsfRow]) -> list[tuple[str, str, str, bool]]:
     return goals
 
 
-def _of_case(rows: Sequence[PsfRow], *, on_axis: bool) -> list[tuple[str, str, bool]]:
-    def meeting(model: str, error: float) -> list[PsfRow]:
+def _of_case(rows: Sequence[Row], *, on_axis: bool) -> list[tuple[str, str, bool]]:
+    def meeting(model: str, error: float) -> list[Row]:
         return [row for row in rows if row.model == model and row.l1_error is not None and row.l1_error <= error]
 
     gaussians = [row for row in rows if row.model == "gaussian"]
@@ -171,7 +260,7 @@ def _of_case(rows: Sequence[PsfRow], *, on_axis: bool) -> list[tuple[str, str, b
     return goals
 
 
-def _ratio(goal: str, fast: Sequence[PsfRow], slow: Sequence[PsfRow]) -> list[tuple[str, str, bool]]:
+def _ratio(goal: str, fast: Sequence[Row], slow: Sequence[Row]) -> list[tuple[str, str, bool]]:
     """The fastest of each."""
     if not fast or not slow:
         return []
@@ -184,22 +273,32 @@ def _ratio(goal: str, fast: Sequence[PsfRow], slow: Sequence[PsfRow]) -> list[tu
     return [(goal, words, ratio >= FASTER)]
 
 
-def judged(rows: Sequence[PsfRow]) -> list[PsfRow]:
+def judged(rows: Sequence[Row]) -> list[Row]:
     """Rows with an estimate, once each: two tolerances may be met by the same kernel."""
     estimated = (row for row in rows if row.estimate is not None)
     return list({(row.lens, row.field, row.model, row.dtype, row.estimate): row for row in estimated}.values())
 
 
-def bench(request: Request) -> Measured:
+def bench(request: Request) -> Page:
     """Every method on every case, random rays, direct sums and targets."""
+    names = dict.fromkeys(request.arguments.lenses or USUAL)
+    chosen = [case for name in names for case in published_cases(Path(name).stem, request.open_lens(name))]
+    with progress(len(chosen), "case", what="measuring") as bar:
+        rows = [row for case in chosen for row in rows_of(case, request, bar)]
     names = ("target", "case", "measured", "met")
     columns = {name: (lambda goal, k=k: goal[k]) for k, name in enumerate(names)} | {"met": lambda goal: yes(goal[3])}
-    result = psf.bench(request, more)
-    goals = targets(result.rows)
-    about = result.about | {"targets": [dict(zip(names, goal, strict=True)) for goal in goals]}
-    machine = in_words(result.about["machine"])
-    lines = ["## Targets", "", *listing(columns, goals), "", f"{machine}. All rows: [csv](speed_vs_error.csv)."]
-    return dataclasses.replace(result, lines=lines, about=about, place=("tables.md", "speed_vs_error"))
+    goals, machine = targets(rows), request.about()
+    about = {"repeats": request.arguments.repeats, "machine": machine}
+    about["targets"] = [dict(zip(names, goal, strict=True)) for goal in goals]
+    lines = [
+        "## Targets",
+        "",
+        *listing(columns, goals),
+        "",
+        f"{in_words(machine)}. All rows: [csv](speed_vs_error.csv).",
+    ]
+    titles = {(case.name, case.field): case.title for case in chosen}
+    return Page(rows, lines, about, functools.partial(psf_figure, titles=titles), ("tables.md", "speed_vs_error"))
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""Speed of the trace against targets: `raytrace bench speed` with limits of the machine and whole processes.
+"""Speed of the trace against targets: peers (`bench_ratios.py`), limits of the machine and whole processes.
 
     python docs/experiments/bench_speed.py --threads 2 --docs docs
 
@@ -21,18 +21,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import bench_kit as kit
+import bench_ratios as speed
 import torch
+from bench_figures import speed_figure
+from bench_kit import Page, Request
+from bench_reference import shape_of
+from pages import listing, significant, yes
 from torch import Tensor
 
-from raytrace.bench import speed
-from raytrace.bench.figures import speed_figure
-from raytrace.bench.measure import Own, Row, Tracer, field_rays, name_of, shape_of, some, surfaces_of
-from raytrace.bench.report import Measured, Request
+from raytrace.bench.measure import Row, Tracer, field_rays, name_of, some, surfaces_of
 from raytrace.cli.progress import progress
 from raytrace.cli.run import say
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
-from raytrace.pages import listing, significant, yes
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_even
@@ -64,7 +65,7 @@ def met(key: str, bound: float, at_most: bool, dtype: str, value: float | None) 
     return value <= bound if at_most else value >= bound
 
 
-def bench(request: Request) -> Measured:
+def bench(request: Request) -> Page:
     """Speeds, limits and whole processes."""
     quick, repeats, threads = request.arguments.quick, request.arguments.repeats, request.threads
     sizes = speed.QUICK if quick else speed.Sizes()
@@ -92,7 +93,7 @@ def bench(request: Request) -> Measured:
             bar.update()
     about = {"machine": request.about(), "compiler": compiled, "repeats": repeats, "sizes": dataclasses.asdict(sizes)}
     page = lines(ratios, sizes=sizes, about=about["machine"], compiled=compiled, repeats=repeats)
-    return Measured(rows, page, speed.document(rows, ratios) | about, speed_figure, ("speed.md", "speed"))
+    return Page(rows, page, speed.document(rows, ratios) | about, speed_figure, ("speed.md", "speed"))
 
 
 def with_limits(bench: speed.Bench, built: "Built | None") -> tuple[speed.Bench, int | None]:
@@ -374,10 +375,10 @@ def serve_rate(dtype: str, rays: int, threads: int) -> None:
         print(done / (time.perf_counter() - start), flush=True)
 
 
-def _tracer_and_rays(dtype: str, count: int) -> tuple[Own, Rays]:
+def _tracer_and_rays(dtype: str, count: int) -> tuple[Tracer, Rays]:
     prepare()
     lens = read_lens("double_gauss")
-    tracer = Own(lens, getattr(torch, dtype), engine="auto", by_indices=True)
+    tracer = speed.EngineTracer(lens, getattr(torch, dtype), engine="auto")
     few = to(field_rays(lens, _PATTERN), dtype=tracer.dtype)
     position, direction = (torch.empty(3, count, dtype=tracer.dtype) for _ in range(2))
     for first in range(0, count, _PATTERN):

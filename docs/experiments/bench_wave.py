@@ -17,18 +17,18 @@ from collections.abc import Callable, Mapping, Sequence
 
 import bench_kit as kit
 import torch
+from bench_figures import dtype_keys, framed, look
+from bench_kit import Page, Request
 from matplotlib.figure import Figure
+from pages import digits, listing, measured, yes
 from torch import Tensor
 
-from raytrace.bench.figures import dtype_keys, framed, look
 from raytrace.bench.measure import clock, name_of, nothing
-from raytrace.bench.report import Measured, Request
 from raytrace.cli.progress import progress
 from raytrace.materials.glass import index
 from raytrace.maths.numerics import to
 from raytrace.maths.result import number
 from raytrace.maths.sampling import grid
-from raytrace.pages import digits, listing, measured, yes
 from raytrace.plotting import style
 from raytrace.psf_models.dft import Aliased, phasor
 from raytrace.tracing.scene import Memo
@@ -97,7 +97,7 @@ class Entrant:
     refused: bool = False
 
 
-def bench(request: Request) -> Measured:
+def bench(request: Request) -> Page:
     """Every engine at several samplings, and the method of Sitzmann et al. (2018), in one thread."""
     chosen, repeats = entrants(), request.arguments.repeats
     with progress(len(chosen) * (1 + repeats), what="measuring") as bar:
@@ -106,7 +106,7 @@ def bench(request: Request) -> Measured:
     document = {"repeats": repeats, "machine": request.about(), "agreement": number(difference)}
     document["targets"] = [dataclasses.asdict(goal) | {"met": goal.met} for goal in goals]
     page = lines(rows, agreement=difference, about=document["machine"], repeats=repeats)
-    return Measured(rows, page, document, wave_figure, ("wave_bench.md", "wave/speed_vs_error"))
+    return Page(rows, page, document, wave_figure, ("wave_bench.md", "wave/speed_vs_error"))
 
 
 def bench_scene(*, exact: bool = False, size: int = SIZE) -> WaveScene:

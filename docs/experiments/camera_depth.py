@@ -2,7 +2,7 @@
 
     python docs/experiments/camera_depth.py double_gauss --data DIR -o FOLDER --docs docs
 
-Everything is in closed form for Gaussian random fields of the pictures' power spectrum (`imaging.depth_estimation`,
+Everything is in closed form for Gaussian random fields of the pictures' power spectrum (`depth_estimation.py`,
 `imaging.restoration`), and differentiable in the sensor distance. Learned cameras are then tested on patches of unseen
 pictures, imaged by wave PSFs. A second call computes what is missing.
 """
@@ -16,18 +16,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import t as student
-from torch import Tensor
-
-from raytrace.experiments import Store
-from raytrace.imaging.closed_form import patch_spectrum
-from raytrace.imaging.depth_estimation import (
+from depth_estimation import (
     blurred_spectra,
     cramer_rao,
     expected_log_likelihood_ratios,
     expected_square_error,
     most_likely,
 )
+from experiments import Store
+from scipy.stats import t as student
+from torch import Tensor
+
+from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.image import blur, transfer_functions, visible
 from raytrace.imaging.pictures import Pictures, crop, digest, draws, files, read, split
 from raytrace.imaging.restoration import (

@@ -28,8 +28,11 @@ from codesign_study import (
     percent,
     summaries,
 )
+from experiments import publish
+from pages import grid, picture, shown
 from torch import Tensor
 
+from raytrace.bench.result import machine
 from raytrace.cli import codesign
 from raytrace.cli.codesign_run import (
     Experiment,
@@ -43,14 +46,12 @@ from raytrace.cli.codesign_run import (
 from raytrace.cli.run import CommandError, present, say
 from raytrace.cli.settings import documents, words
 from raytrace.cli.types import file_name, seed_number
-from raytrace.experiments import publish
 from raytrace.files import table
 from raytrace.imaging.closed_form import even_distances, scan
 from raytrace.imaging.codesign import OPTIMUM_COLUMNS, STEPS, Optimum, batch, camera, lens_at_start, outcome, usual
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.maths.result import Result, plain
-from raytrace.pages import grid, machine, picture, shown
 from raytrace.settings import GAUSSIAN, MODELS, CodesignSettings
 from raytrace.shards import processes, share
 from raytrace.system.lens import Lens

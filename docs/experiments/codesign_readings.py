@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from codesign_study import NAMES
-
-from raytrace.pages import grid, write_page
+from pages import grid, write_page
 
 #: Folder and reading.
 READINGS = {

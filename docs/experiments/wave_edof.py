@@ -18,8 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments import publish, published
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from pages import grid, picture
 from torch import Tensor
 
 from raytrace.cli import wave_design
@@ -30,7 +32,6 @@ from raytrace.cli.settings import add_options, defaults_of, documents, picture_o
 from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
-from raytrace.experiments import publish, published
 from raytrace.files import table as csv
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
@@ -53,7 +54,6 @@ from raytrace.imaging.wave_camera import (
     transfer,
 )
 from raytrace.maths.result import Result, plain
-from raytrace.pages import grid, picture
 from raytrace.plotting.style import FIELD_COLOURS, new_figure, save, show_image, styled
 from raytrace.settings import DesignSettings
 from raytrace.wave_optics.designs import Aim, aim, baseline

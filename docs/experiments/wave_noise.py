@@ -24,7 +24,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments import Store, cases, publish, published
 from matplotlib.figure import Figure
+from pages import grid, picture
 from torch import Tensor
 from wave_edof import ROWS, STRENGTHS, contents_of, look, title_of
 
@@ -44,7 +46,6 @@ from raytrace.cli.settings import (
 from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import learn
-from raytrace.experiments import Store, cases, publish, published
 from raytrace.files import table
 from raytrace.imaging.pictures import Pictures, draws
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, wiener
@@ -62,7 +63,6 @@ from raytrace.imaging.wave_camera import (
 from raytrace.imaging.wave_design import WaveCamera
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import Result
-from raytrace.pages import grid, picture
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings

@@ -25,6 +25,7 @@ from raytrace.system.lens import Lens
 from raytrace.tracing.launch import is_at_infinity
 from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
 from raytrace.tracing.trace import is_bent
+from raytrace.words import option
 
 NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
 SAMPLES = 11  # fields of a curve, from the axis to the largest
@@ -241,7 +242,7 @@ def lateral_colour(
     if len(lens.wavelengths) < 2:
         raise NothingToShow(
             "nothing to show: lateral colour is a difference of wavelengths, and there is one, "
-            f"{float(lens.wavelengths[0]):g} µm; give several by `wavelengths`"
+            f"{float(lens.wavelengths[0]):g} µm; give several by {option('wavelengths')}"
         )
     refuse_axis(fields)
     return shown(lateral_colour_of(lens, fields))

@@ -12,6 +12,7 @@ from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, number_text
 from raytrace.system.lens import Lens, check_media, with_wavelengths
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import side_behind
+from raytrace.words import option
 
 
 @value
@@ -64,8 +65,10 @@ def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: i
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
     low, high = lens.wavelengths.min(), lens.wavelengths.max()
     if not bool(high > low):
-        raise NothingToShow("nothing to show over wavelength: the lens has a single one; give a range by `wavelengths`")
-    afford(RAY_BYTES * samples, f"{samples:,} wavelengths", helps="ask for fewer `samples`")
+        raise NothingToShow(
+            f"nothing to show over wavelength: the lens has a single one; give a range by {option('wavelengths')}"
+        )
+    afford(RAY_BYTES * samples, f"{samples:,} wavelengths", helps="ask for fewer {samples}")
     places = low + (high - low) * torch.linspace(0.0, 1.0, samples, **like(lens))
     check_media(lens, places)
     primary = primary_wavelength(lens)

@@ -20,6 +20,7 @@ from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distan
 from raytrace.tracing.focus import NoImage, focused, real_image_distance
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.trace import need_axis
+from raytrace.words import option
 
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
@@ -221,7 +222,8 @@ def compare(
     except NoImage as error:
         length = float(first_order(lens).effective_focal_length)
         raise NoImage(
-            f"{error}; its focal length is {length:.6g} mm, give `focus_distance` and `object_distances` beyond, or inf"
+            f"{error}; its focal length is {length:.6g} mm, give {option('focus_distance')} and "
+            f"{option('object_distances')} beyond, or inf"
         ) from error
     pixels = grid(lens.wavelengths.new_tensor(pixel), size)
     with warnings.catch_warnings():

@@ -25,6 +25,7 @@ from raytrace.system.lens import Lens, vector
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.spot import image_rays
+from raytrace.words import option
 
 _RAYS = 4096
 _RINGS_PER_STEP = 16
@@ -107,7 +108,11 @@ def _encircled(lens: Lens, fields: Tensor, radii: Tensor | None, geometric: bool
 def _rays(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (F, W·P) from the centroid (2, F) of all wavelengths, and shares (F, W·P) of the light."""
     F, W = fields.shape[1], len(lens.wavelengths)
-    afford(64 * F * W * _RAYS, f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)", helps="ask for fewer `fields`")
+    afford(
+        64 * F * W * _RAYS,
+        f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)",
+        helps="ask for fewer {fields}",
+    )
     parts = [_rays_of(lens, some) for some in fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
     distance, energy, centroid = zip(*parts, strict=True)
     return torch.cat(distance), torch.cat(energy), torch.cat(centroid, 1)
@@ -182,7 +187,8 @@ def _refuse_far(offset: Tensor, reach: Tensor) -> None:
     if bool(offset > reach):
         raise ValueError(
             f"light of one wavelength lands {float(offset):.3g} mm from the centroid of all, beyond the "
-            f"{float(reach):.3g} mm that waves are followed: ask for `geometric`, or for one of the `wavelengths`"
+            f"{float(reach):.3g} mm that waves are followed: ask for {option('geometric')}, or for one of the "
+            f"{option('wavelengths')}"
         )
 
 

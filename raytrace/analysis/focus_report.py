@@ -54,7 +54,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.tracing.ray_failures import LostRays, warn_of_failures
 from raytrace.tracing.spot import image_rays
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
 
 _SAMPLES = 401  # of a curve through focus
 _MOST_SPOTS = 5  # columns of spots that stay legible
@@ -255,14 +255,14 @@ def focus(
     like = lens.surfaces[-2].thickness
     pupil, weights = sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)
-    shares = _weights(lens, distance_weights, len(distances), "`distance_weights`")
+    shares = _weights(lens, distance_weights, len(distances), option("distance_weights"))
     scene = Conjugates(
         object_distances=distances,
         fields=fields,
         wavelengths=wavelengths,
         distance_weights=shares,
-        field_weights=_weights(lens, field_weights, fields.shape[1], "`field_weights`"),
-        wavelength_weights=_weights(lens, wavelength_weights, len(wavelengths), "`wavelength_weights`"),
+        field_weights=_weights(lens, field_weights, fields.shape[1], option("field_weights")),
+        wavelength_weights=_weights(lens, wavelength_weights, len(wavelengths), option("wavelength_weights")),
         rings=(rings or SAMPLINGS["gauss"][2]) if sampling == "gauss" else None,
     )
     if not bool(torch.isfinite(paraxial).all()):
@@ -270,7 +270,7 @@ def focus(
     rms = focus_of_rms(lens, pupil, weights, **scene)
     _check_rays(lens, pupil, distances, fields, wavelengths)
     if not bool(torch.isfinite(rms)):
-        raise NoFocus("one ray, or parallel rays, have no focus; give more `rings` or `points`")
+        raise NoFocus(f"one ray, or parallel rays, have no focus; give more {option('rings')} or {option('points')}")
     best = rms
     if criterion == "mean":
         best = focus_of_mean_radius(lens, pupil, weights, **scene)
@@ -300,12 +300,12 @@ def focus(
     return result
 
 
-def _weights(lens: Lens, weights: Sequence[float] | Tensor | None, count: int, option: str) -> Tensor | None:
+def _weights(lens: Lens, weights: Sequence[float] | Tensor | None, count: int, name: str) -> Tensor | None:
     if weights is None:
         return None
     weights = vector(weights, like=lens)
     if len(weights) != count:
-        raise ValueError(f"{option}: {len(weights)} given, expected {count}, one for each")
+        raise ValueError(f"{name}: {len(weights)} given, expected {count}, one for each")
     return weights
 
 

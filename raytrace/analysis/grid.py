@@ -115,7 +115,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     refuse_axis(largest)
     warn_of_filling(lens, largest)
     rays = points**2 * len(lens.wavelengths)
-    afford(RAY_BYTES * rays, f"{rays:,} chief rays of {points:,} × {points:,} objects", helps="ask for fewer `points`")
+    afford(RAY_BYTES * rays, f"{rays:,} chief rays of {points:,} × {points:,} objects", helps="ask for fewer {points}")
     described, _, corner, exists = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)

@@ -33,6 +33,7 @@ from raytrace.tracing.geometry import edge_radius, warn_of_defects
 from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
 from raytrace.tracing.lens_report import Info, text
 from raytrace.tracing.trace import trace_lens
+from raytrace.words import option
 
 if TYPE_CHECKING:  # slow to load
     from matplotlib.patches import Polygon
@@ -127,11 +128,14 @@ def layout(
     Raises ValueError for an unknown view or configuration.
     """
     if view not in VIEWS:
-        raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
+        raise ValueError(f"{option('view', view)}: expected one of {', '.join(VIEWS)}")
     if configuration == ALL and view == "3d":
-        raise ValueError("`view=3d`: shows one configuration; `configuration=all` is drawn from the side or from above")
+        raise ValueError(
+            f"{option('view', '3d')}: shows one configuration; {option('configuration', 'all')} is drawn from the "
+            "side or from above"
+        )
     if isinstance(configuration, str) and configuration != ALL:
-        raise ValueError(f"`configuration={configuration}`: expected a number from 1, or {ALL}")
+        raise ValueError(f"{option('configuration', configuration)}: expected a number from 1, or {ALL}")
     if isinstance(configuration, int):
         lens = lens.configuration(configuration)
     chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
@@ -141,7 +145,7 @@ def layout(
     points = field_points(fields, like=lens)
     count = rays * points.shape[1] * (1 if chosen is None else len(chosen))
     surfaces = len(lens.surfaces)
-    afford(RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps="ask for fewer `rays`")
+    afford(RAY_BYTES * count * surfaces, f"{count:,} rays at {surfaces} surfaces", helps="ask for fewer {rays}")
     warn_of_filling(lens, points)
     return Layout(lens, points, rays, view, chosen, every, fields is not None)
 

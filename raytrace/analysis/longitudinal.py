@@ -60,7 +60,7 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
     count = points * len(lens.wavelengths)
-    afford(RAY_BYTES * count, f"{count:,} rays", helps="ask for fewer `points`")
+    afford(RAY_BYTES * count, f"{count:,} rays", helps="ask for fewer {points}")
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
     on_axis = torch.stack([torch.zeros_like(heights), heights])

@@ -46,6 +46,7 @@ from raytrace.tracing.clear_pupil import clear_pupil
 from raytrace.tracing.f_number import axial_f_number, working_f_number
 from raytrace.tracing.scene import Memo, Scene
 from raytrace.tracing.spot import image_rays, spot_of
+from raytrace.words import option
 
 _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
@@ -192,14 +193,17 @@ def mtf(
     the blur is too large.
     """
     if lens.count is not None and not (geometric and through_focus is None and frequencies is not None):
-        message = "a batch of lenses has the geometric MTF alone: give `frequencies` and `geometric=True`"
+        message = (
+            f"a batch of lenses has the geometric MTF alone: give {option('frequencies')} and "
+            f"{option('geometric', 'True')}"
+        )
         raise ValueError(f"{message}, or call it for each lens")
     lens, fields = setting(aligned(lens, 3), fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
     choice = None if geometric is None else torch.full_like(fields[0], geometric, dtype=torch.bool)
     if through_focus is not None:
         if asked is None or len(asked) != 1:
-            raise ValueError("`through_focus` needs one spatial frequency: give `frequencies`")
+            raise ValueError(f"{option('through_focus')} needs one spatial frequency: give {option('frequencies')}")
         distances = lens.surfaces[-2].thickness + through_focus * torch.linspace(-1, 1, _DISTANCES, **like(lens))
         return _through_focus(lens, fields, asked, distances, choice, progress)
     given = frequency_range(lens, fields, _FREQUENCIES) if asked is None else asked

@@ -17,7 +17,7 @@ from raytrace.tracing.ray_failures import check_reach, ray_failures
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
-from raytrace.words import RaytraceError, RaytraceWarning
+from raytrace.words import RaytraceError, RaytraceWarning, option
 
 #: Fields, y or pairs (x, y), and other numbers as analyses take them; None: those of the lens.
 Points = Tensor | Sequence | float | None
@@ -79,7 +79,7 @@ def like(lens: Lens) -> dict:
 
 def field_range(lens: Lens, size: int) -> Tensor:
     """Fields (2, size) along y from the axis to the lens's largest. Raises OverBudget for too many to be traced."""
-    afford(RAY_BYTES * size * len(lens.wavelengths), f"{size:,} fields", helps="ask for fewer `samples`")
+    afford(RAY_BYTES * size * len(lens.wavelengths), f"{size:,} fields", helps="ask for fewer {samples}")
     return largest_field(lens) * torch.linspace(0.0, 1.0, size, **like(lens))
 
 
@@ -116,7 +116,9 @@ def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, quantity: str) -> None:
 def refuse_axis(fields: Tensor) -> None:
     """Raise NothingToShow for fields (2, F) that lie all on the axis."""
     if not bool(fields.any()):
-        raise NothingToShow("nothing to show over the field: all fields are on the axis; give others by `fields`")
+        raise NothingToShow(
+            f"nothing to show over the field: all fields are on the axis; give others by {option('fields')}"
+        )
 
 
 def unvignetted(lens: Lens) -> Lens:

@@ -33,7 +33,7 @@ from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
 from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
 from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, image_rays, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
-from raytrace.words import calling_level
+from raytrace.words import calling_level, option
 
 _KERNELS = 64  # whose clear pupils are searched at once
 _TRIED = 4096  # rays that are traced again for the cause where all fail
@@ -157,7 +157,7 @@ class Spots(Result):
         """
         if self.lens.count is not None:
             raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
-        lens, points, rays = detached(self.lens), self.fields.detach(), self._kept("`plot`")
+        lens, points, rays = detached(self.lens), self.fields.detach(), self._kept(option("plot"))
         about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
         whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
         radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
@@ -192,11 +192,11 @@ class Spots(Result):
 
     def save(self, path: str | PathLike) -> None:
         """Write the rays as .csv: field, wavelength, pupil point, x, y, weight, status."""
-        self._kept("`output`").save(path)
+        self._kept(option("output")).save(path)
 
-    def _kept(self, option: str) -> Arrivals:
+    def _kept(self, use: str) -> Arrivals:
         if self.arrivals is None:
-            raise ValueError(f"{option} needs the rays, and `rays` keeps none: leave one out")
+            raise ValueError(f"{use} needs the rays, and {option('rays')} keeps none: leave one out")
         return self.arrivals
 
 
@@ -240,7 +240,9 @@ def spot(
     warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     if rays is not None:
         if lens.count is not None:
-            raise ValueError("`rays` traces one lens, not a batch: leave it out, or choose a lens, as lens[0]")
+            raise ValueError(
+                f"{option('rays')} traces one lens, not a batch: leave it out, or choose a lens, as lens[0]"
+            )
         _refuse_of_many(sampling, rings, points, reference, weights)
         rule = "random" if sampling == "random" else "sobol"
         return _of_many(lens, fields, rays, rule, seed, ray_aiming, max_bytes, progress)
@@ -324,12 +326,17 @@ def _put(spots: Spot, parts: Sequence[Spot], lenses: Tensor) -> Spot:
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:
     if (reference, weights) != ("centroid", "area"):
-        raise ValueError("`rays` gives radii about the centroid by area: leave `reference` and `weights` out")
+        raise ValueError(
+            f"{option('rays')} gives radii about the centroid by area: leave {option('reference')} and "
+            f"{option('weights')} out"
+        )
     for name, given in (("rings", rings), ("points", points)):
         if given is not None:
-            raise ValueError(f"`rays` and `{name}` exclude each other: both are a number of rays")
+            raise ValueError(f"{option('rays')} and {option(name)} exclude each other: both are a number of rays")
     if sampling in ("hexapolar", "square"):
-        raise ValueError(f"`rays` takes `sampling=sobol` (its default) or random, not {sampling}")
+        raise ValueError(
+            f"{option('rays')} takes {option('sampling', 'sobol')} (its default) or random, not {sampling}"
+        )
 
 
 def _of_many(

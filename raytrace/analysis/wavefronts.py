@@ -152,7 +152,7 @@ def wavefront(
     afford(
         _MAP_BYTES * F * W * size * size,
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
-        helps="ask for a smaller `size`, or fewer fields or wavelengths",
+        helps="ask for a smaller {size}, or fewer fields or wavelengths",
     )
     zernike.refuse_few(math.prod(_RINGS), terms or 37)  # before they are computed
     listed = bool(terms or numbering)

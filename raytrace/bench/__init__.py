@@ -1,17 +1,15 @@
-"""Benchmarks: speed against error, by independent references of high precision, and compared with other packages.
+"""`raytrace bench`: speed against error of the trace, of PSFs and of pictures, on a lens and a machine of the user.
 
-| module      | contents                                                                                    |
-|-------------|---------------------------------------------------------------------------------------------|
-| `command`   | `raytrace bench trace`, `psf` and `speed`                                                   |
-| `measure`   | tracers, their errors, and calls timed in turns                                             |
-| `trace`     | speed of the trace over the number of rays                                                  |
-| `speed`     | ratios to peers: batches, gradients, aspheres, the step of the sensor distance              |
-| `psf`       | cases and methods of PSFs, their converged kernels, times and errors                        |
-| `reference` | a ray tracer of 50 digits, reference of the others                                          |
-| `peers`     | Optiland and ray-optics, with the extra [bench]                                             |
-| `report`    | rows as page, CSV, JSON and figure; `figures` draws                                         |
+| module      | contents                                                                             |
+|-------------|--------------------------------------------------------------------------------------|
+| `command`   | the command: its subjects and their options                                          |
+| `trace`     | speed of the trace over the number of rays                                           |
+| `psf`       | time of every PSF model at every sampling, and its error against a converged kernel  |
+| `camera`    | time of a training step and of a picture, and its error against direct superposition |
+| `measure`   | tracers, their errors, and calls timed in turns                                      |
+| `reference` | a ray tracer of 50 digits, the reference of the trace                                |
+| `result`    | measurements as text, CSV, JSON and figure                                           |
 
-A PSF case is a row of `psf.USUAL`, a method a row of `psf.methods`, a stage of the speed benchmark a row of
-`speed.STAGES`; a peer has the methods of `measure.Tracer`. Tests: `tests/test_bench*.py`. Scripts that make the
-published pages from these measurements are `docs/experiments/bench_*.py`.
+Comparisons with other packages, limits of the machine and the published pages are `docs/experiments/bench_*.py`.
+Tests: `tests/test_bench_*.py`.
 """

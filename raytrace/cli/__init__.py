@@ -3,16 +3,15 @@
 `main(argv)` runs any command in-process and returns its exit code. A command's module, and torch with it, is imported
 only when the command runs, so that `raytrace --help` answers at once.
 
-- `commands`: the table of commands: summary, examples and exceptions from the rule that an option is a parameter of the
-  public function of that name; `parameters` reads those from signature and docstring, without importing the function.
-- `options`: options that several commands share, and `ROWS`, what signatures do not say; `types`: their values.
+- `commands`: the table of commands, each with its summary, examples and options; `options`: the table of options that
+  several commands share; `types`: readers of their values.
 - `run`: the runner: opens the lens, calls the function, prints, saves; `progress`: bars.
-- `render_run`: files of pictures through a lens.
+- `runs`, `render_run`: commands that do more.
 - `codesign`, `wave_…`, `settings`: co-design and phase elements, whose options are fields of settings.
 
-To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function with its
-entry in the docstring; a row where its type or spelling is not that of its annotation. Tests: `test_cli`,
-`test_cli_options`, `test_public`, `test_render_command`, `test_wave_cli`, `test_codesign_cli`.
+To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function and an
+`Option` in the row of its command, or in `OPTIONS` if several commands have it. Tests: `test_cli`, `test_cli_options`,
+`test_public`, `test_render_command`, `test_wave_cli`, `test_codesign_cli`.
 """
 
 import argparse
@@ -20,11 +19,12 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from raytrace.budget import keep_freed_memory
 from raytrace.files import NotWritten
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, in_command
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
 
@@ -46,26 +46,26 @@ traces by torch alone, =compiled always by C++, and RAYTRACE_CACHE is the folder
 class _Parser(argparse.ArgumentParser):
     """argparse, with its usage errors in one line like every other error, that suggests the nearest option."""
 
-    def __init__(self, *arguments, **settings):
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")  # -3,4 and -1e-3 are no options
 
-    def error(self, message: str):
+    def error(self, message: str) -> NoReturn:
         print(f"raytrace: error: {message}; see `{self.prog} --help`", file=sys.stderr)
         raise SystemExit(2)
 
-    def _parse_optional(self, arg_string):
-        """An option may also be spelled as the keyword of its verb: --fields for --field."""
+    def _parse_optional(self, arg_string: str) -> Any:
+        """An option may also be spelled as the parameter of its function: --fields for --field."""
         name, sign, value = arg_string.partition("=")
         if name not in self._option_string_actions and name.startswith("--"):
-            keyword = name[2:].replace("-", "_")
-            spelled = (a for a in self._actions if a.option_strings and a.dest == keyword)
-            known = next((a for a in spelled if a.const is not False), None)  # --distortion is not --no-distortion
-            arg_string = arg_string if known is None else known.option_strings[-1] + sign + value
+            parameter = name[2:].replace("-", "_")
+            actions = (a for a in self._actions if a.option_strings and a.dest == parameter)
+            action = next((a for a in actions if a.const is not False), None)  # --distortion is not --no-distortion
+            arg_string = arg_string if action is None else action.option_strings[-1] + sign + value
         return super()._parse_optional(arg_string)
 
-    def parse_known_args(self, args=None, namespace=None):
-        found, unknown = super().parse_known_args(args, namespace)
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        arguments, unknown = super().parse_known_args(args, namespace)
         option = next((word for word in unknown if word.startswith("-")), None)
         if option is not None:
             name = option.partition("=")[0]
@@ -74,9 +74,9 @@ class _Parser(argparse.ArgumentParser):
             meant = "; figures are saved by --plot" if drawn else did_you_mean(name, known)
             meant = "; tables are saved by -o FILE.csv" if name == "--csv" and "-o" in known else meant
             self.error(f"unknown option {name}{meant}")
-        return found, unknown
+        return arguments, unknown
 
-    def _check_value(self, action, value):
+    def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             listed = ", ".join(map(str, action.choices))
             meant = did_you_mean(str(value), map(str, action.choices))
@@ -107,12 +107,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = build_parser(next((word for word in words if not word.startswith("-")), "")).parse_args(words)
     except SystemExit as stop:  # argparse printed its help or its usage error
         return stop.code if isinstance(stop.code, int) else 2
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), in_command(arguments.flags):
         warnings.simplefilter("always")
-        spelled = arguments.spelled
         shown: set[type[Warning]] = set()
         of_result: list[str] = []
-        warnings.showwarning = _shower(spelled, shown, of_result)
+        warnings.showwarning = _shower(shown, of_result)
         try:
             from raytrace.budget import within
             from raytrace.cli.progress import heartbeat
@@ -133,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if os.environ.get("RAYTRACE_TRACEBACK"):
                 raise
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
-                return _fail(as_options(_one_line(error), spelled), 1)
+                return _fail(_one_line(error), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
                 return _fail(f"not enough memory{_largest(arguments)}; --max-bytes refuses sooner", 1)
             kind = type(error).__name__
@@ -153,24 +152,12 @@ def script() -> None:
     sys.exit(main())
 
 
-def as_options(message: str, spelled: Mapping[str, str]) -> str:
-    """A message with keywords in backticks, `fields` or `model=drt`, spelled as options: --field, --model drt."""
-
-    def option(match: re.Match) -> str:
-        if match[1] not in spelled:
-            return match[0]
-        return spelled[match[1]] + (f" {match[2]}" if match[2] else "")
-
-    return re.sub(r"`(\w+)(?:=([^`]*))?`", option, message)
-
-
 def _largest(arguments: argparse.Namespace) -> str:
     """The option with the largest number, of which less may help, as the end of a message."""
-    numbers = {
-        name: value for name, value in vars(arguments).items() if type(value) is int and name in arguments.spelled
-    }
-    name = max(numbers, key=numbers.get, default=None)
-    return f"; ask for less by {arguments.spelled[name]}, which is {numbers[name]}" if name else ""
+    values = vars(arguments)
+    numbers = [(values[name], flag) for name, flag in arguments.flags.items() if type(values.get(name)) is int]
+    number, flag = max(numbers, default=(0, ""))
+    return f"; ask for less by {flag}, which is {number}" if flag else ""
 
 
 def _fail(message: str, code: int) -> int:
@@ -178,7 +165,7 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _one_line(error: BaseException) -> str:
+def _one_line(error: BaseException | str) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, OSError) and error.strerror:
@@ -186,19 +173,18 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _shower(spelled: Mapping[str, str], shown: set[type[Warning]], of_result: list[str]) -> Callable[..., None]:
+def _shower(shown: set[type[Warning]], of_result: list[str]) -> Callable[..., None]:
     """Shows warnings of this package, one line each and none twice, and adds their categories to `shown`; those of
     libraries speak to programmers. of_result: collects those that qualify a result (`of_result` of their category),
     which are not shown where there is none.
     """
-    said = set()
+    lines = set()
 
-    def show(message, category, filename, lineno, file=None, line=None) -> None:
-        words = as_options(_one_line(message), spelled)
-        if category.__module__.startswith("raytrace") and words not in said:
-            said.add(words)
+    def show(message: Warning | str, category: type[Warning], *place: object) -> None:
+        line = f"raytrace: warning: {_one_line(message)}"
+        if category.__module__.startswith("raytrace") and line not in lines:
+            lines.add(line)
             shown.add(category)
-            line = f"raytrace: warning: {words}"
             if getattr(category, "of_result", False):
                 of_result.append(line)
             else:

@@ -2,8 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import ROWS as OPTIONS
-from raytrace.cli.options import catalog, json, output_folder, plot, substitute
+from raytrace.cli.options import OPTIONS, catalog, json, output_folder, plot, substitute
 from raytrace.cli.settings import SEED, add_options, defaults_of, listed, option, picture_options, settings_options
 from raytrace.cli.types import (
     count,
@@ -115,7 +114,7 @@ ROWS = {
         "rays beyond the semi-diameters of the file: traced (none, default), or vignetted (semi-diameters)",
         choices=("none", "semi-diameters"),
     ),
-    "ray_aiming": option(**OPTIONS["ray_aiming"]),
+    "ray_aiming": option(OPTIONS["ray_aiming"].help, choices=OPTIONS["ray_aiming"].choices),
     "sensor": option(
         "width and height in mm, as 24x16: pictures in colour at random places of the sensor, with the PSFs, the "
         "lateral colour and the noise there (default: grey pictures of --field)",
@@ -212,7 +211,7 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     output_folder(
         "folder of the run; the optimised lens is lens.zmx there. A lens file (.zmx, .csv) is written in addition to a "
         "folder of the same name without suffix",
-        type=folder_or_lens,
+        reader=folder_or_lens,
     )(parser)
     parser.add_argument("--device", metavar="NAME", default="cpu", help="of the training, cpu or cuda (default cpu)")
     parser.add_argument("--resume", action="store_true", help="only resume a run in FOLDER, start none")

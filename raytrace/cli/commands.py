@@ -1,47 +1,41 @@
 """The commands of `raytrace`: a row each, with summary, description, examples and options. Imports no torch.
 
 A command calls the function of the public API that has its name. An option's destination is the name of that function's
-parameter. A new command is a new row. Commands that do more than call the function once have a function `run`.
+parameter. A new command is a new row. A command that does more than call the function once names its own in `run`.
 """
 
 import argparse
-import importlib
-import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass
 from types import ModuleType
 
-from raytrace import PUBLIC
 from raytrace.cli import codesign, wave_design, wave_restore
 from raytrace.cli.options import (
+    APERTURE,
     AS_BUILT,
+    CONDITIONS,
     FREEDOM,
-    LENS_SUFFIXES,
+    LENS,
     MERIT,
+    MODELS,
+    OPTIONS,
     PUPIL,
+    TABLE,
     Adder,
-    aperture,
-    catalog,
+    Option,
+    add,
     conditions,
     exclusive,
     group,
-    json,
-    lens,
-    log,
-    max_bytes,
     object_distance,
-    option,
     output,
     output_folder,
-    parameters,
     plot,
     row,
+    switch,
 )
 from raytrace.cli.types import (
-    Names,
     count,
+    count_or_all,
     count_or_none,
     data_file,
     extent,
@@ -49,48 +43,38 @@ from raytrace.cli.types import (
     file_of,
     finite,
     folder_name,
+    lens_file,
     many,
     not_negative,
-    output_file,
-    picture_file,
     picture_or_folder,
+    positive,
     positive_finite,
 )
-from raytrace.cli.wave_options import camera, element, engine, light, pixels
-
-#: -o of an analysis: `Result.save`.
-table = output("table to write (.csv), or the document of --json (.json)", (".csv", ".json"))
+from raytrace.cli.wave_options import ENGINE, camera, element, light, pixels
 
 
 @dataclass(frozen=True)
 class Command:
     """One command.
 
-    examples: the last part of its help page; options: functions that add options to a parser; rows: settings of
-    `add_argument` of the remaining options, the parameters of the public function `verb`; run: returns the result,
-    where it is more than a call of that function with a lens.
+    examples: the last part of its help page; options: names of rows of OPTIONS, further rows, and groups of both; run:
+    module and function that return the result, where it is more than a call of the public function `verb` with a lens.
     """
 
     name: str
     summary: str
     description: str
     examples: str
-    options: tuple[Adder, ...]
-    run: Callable[[argparse.Namespace], object] | None = None
-    rows: Mapping[str, Mapping] = field(default_factory=dict)
+    options: tuple[str | Adder, ...]
+    run: str | None = None
+    subcommands: tuple["Command", ...] = ()
 
     @property
     def verb(self) -> str:
         """Name of the public function."""
         return self.name.replace("-", "_")
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        for add in self.options:
-            add(parser)
-        if self.verb in PUBLIC:
-            parameters(self.verb, **self.rows)(parser)
-
-    def add_to(self, commands, name: str = "", *, with_options: bool = True) -> None:
+    def add_to(self, commands: argparse._SubParsersAction, name: str = "", *, with_options: bool = True) -> None:
         """Add the parser of this command to a group of parsers, under its own name or another."""
         parser = commands.add_parser(
             name or self.name,
@@ -99,132 +83,27 @@ class Command:
             epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        if not with_options:
-            return
-        self.add_arguments(parser)
-        max_bytes(parser)
-        spelled = {action.dest: action.option_strings[-1] for action in parser._actions if action.option_strings}
-        parser.set_defaults(run=self, spelled=spelled)
+        if with_options and self.subcommands:
+            children = parser.add_subparsers(dest="subcommand", metavar="SUB", required=True)
+            for command in self.subcommands:
+                command.add_to(children, command.name.removeprefix(f"{self.name}-"))
+        elif with_options:
+            add(parser, self.options)
+            flags = {action.dest: action.option_strings[-1] for action in parser._actions if action.option_strings}
+            parser.set_defaults(run=self, flags=flags, suffix="")
 
 
-def _command(name: str, summary: str, description: str, examples: str, /, *options: Adder, run=None, **rows) -> Command:
-    """A row; examples: one a line, without `raytrace NAME`; rows: as for `Command`, or the help text alone."""
+def _command(
+    name: str, summary: str, description: str, examples: str, /, *options: str | Adder, run: str | None = None
+) -> Command:
+    """A row; examples: one a line, without `raytrace NAME`."""
     start = f"  raytrace {name.replace('wave-', 'wave ')} "
     text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
-    rows = {name: {"help": row} if isinstance(row, str) else row for name, row in rows.items()}
-    return Command(name, summary, description, text, options, run, rows)
+    return Command(name, summary, description, text, options, run)
 
 
-def _of_module(name: str, module: ModuleType, run: Callable) -> Command:
-    return Command(name, module.SUMMARY, module.DESCRIPTION, module.EXAMPLES, (module.options,), run)
-
-
-# -- commands that do more than call their function once
-
-
-def _with_catalogs(arguments: argparse.Namespace, **paths: Path):
-    """The result of a function that takes catalogs, and no lens."""
-    import raytrace
-    from raytrace.cli.run import catalogs, options_of
-
-    options = options_of(arguments) | paths | {"catalogs": catalogs(arguments)}
-    return raytrace.public_name(arguments.run.verb)(**options)
-
-
-def _check(arguments: argparse.Namespace):
-    from raytrace.cli.run import find_lens
-
-    return _with_catalogs(arguments, path=find_lens(arguments.lens))
-
-
-def _convert(arguments: argparse.Namespace):
-    from raytrace.cli.run import find_lens
-
-    return _with_catalogs(arguments, source=find_lens(arguments.source))
-
-
-def _tolerance(arguments: argparse.Namespace):
-    from raytrace.cli.run import CommandError, catalogs, printed_on_failure, result_of_lens, say
-    from raytrace.shards import share
-
-    folder = arguments.save_trials
-    if folder and arguments.trials == 0:
-        raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
-    result = result_of_lens(arguments)
-    if folder and not share().rank:
-        folder = f"{folder}{getattr(arguments, 'suffix', '')}"
-        with printed_on_failure(result, arguments):
-            result.save_trials(folder, catalogs=catalogs(arguments))
-        say(f"written: typical.zmx, worst.zmx and best.zmx in {folder}")
-    return result
-
-
-def _bench(arguments: argparse.Namespace):
-    # Benchmarks are a layer above the commands, so the import is dynamic.
-    return importlib.import_module("raytrace.bench.command").run(arguments)
-
-
-def _layout(arguments: argparse.Namespace):
-    from raytrace.cli.run import result_of_lens
-
-    arguments.plot = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"
-    return result_of_lens(arguments)
-
-
-def _spot(arguments: argparse.Namespace):
-    from raytrace.cli.run import CommandError, result_of_lens
-
-    for flag, path in (("--plot", arguments.plot), ("-o", arguments.output)):
-        if path and arguments.rays:
-            raise CommandError(f"{flag} needs the rays, and --rays keeps none: leave one out")
-    return result_of_lens(arguments)
-
-
-def _focus(arguments: argparse.Namespace):
-    """The focus; -o writes the lens of the file with the new sensor distance, without the conditions of the options."""
-    from raytrace.cli.run import catalogs, find_lens, printed_on_failure, result_of_lens, say
-    from raytrace.io import read_lens, write_lens
-    from raytrace.system.lens import with_sensor_distance
-
-    focus = result_of_lens(arguments)
-    if arguments.output:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # shown when the file was first read
-            original = read_lens(
-                find_lens(arguments.lens),
-                catalogs=catalogs(arguments),
-                substitute=arguments.substitute,
-                configuration=arguments.configuration,
-            )
-        with printed_on_failure(focus, arguments):
-            write_lens(with_sensor_distance(original, focus.sensor_distance), arguments.output)
-        say(f"written: {arguments.output}")
-        arguments.output = None
-    return focus
-
-
-def _trace(arguments: argparse.Namespace) -> None:
-    """The table of rays, written as it is computed and not kept in memory."""
-    import sys
-
-    from raytrace.cli.progress import Lines, progress
-    from raytrace.cli.run import print_json, result_of_lens, say
-
-    listing = result_of_lens(arguments)
-    if arguments.output:
-        with progress(listing.count, "ray", what="trace") as bar:
-            listing.save(arguments.output, bar.update)
-        if arguments.json:
-            print_json({"rays": listing.count, "output": arguments.output, "lost": listing.lost()})
-        else:
-            say(f"{listing.count} rays written to {arguments.output}")
-    elif arguments.json:
-        listing.write_json(sys.stdout.write)
-    else:
-        with Lines(listing.count, "ray", what="trace") as lines:  # no bar: the terminal may show the rays
-            listing.write(sys.stdout.write, lines.update)
-    for line in listing.failures():
-        say(line)
+def _of_module(name: str, module: ModuleType, run: str) -> Command:
+    return Command(name, module.SUMMARY, module.DESCRIPTION, module.EXAMPLES, (module.options, "max_bytes"), run)
 
 
 _WAVE_FIGURES = {
@@ -232,76 +111,6 @@ _WAVE_FIGURES = {
     "caustic": "the light behind the element, over distance and radius,",
     "encircled": "the fraction of the light within a radius",
 }
-
-
-def _view(arguments: argparse.Namespace) -> None:
-    """The viewer until Ctrl-C."""
-    from raytrace.cli.progress import silence
-    from raytrace.cli.run import CommandError, find_lens, open_lens
-    from raytrace.viewer.server import MissingExtra, serve
-
-    path = find_lens(arguments.lens)
-    silence()
-    file = path if Path(arguments.lens).exists() else Path(path.name)
-    try:
-        serve(open_lens(arguments), file=file, port=arguments.port, browser=arguments.browser, as_json=arguments.json)
-    except MissingExtra as error:
-        raise CommandError(str(error)) from error
-
-
-def _wave_psf(arguments: argparse.Namespace):
-    import raytrace
-    from raytrace.cli.run import catalogs, options_of, printed_on_failure, say
-
-    options = options_of(arguments) | {"catalog": catalogs(arguments)}
-    psf = raytrace.wave_psf(**options)
-    for name in _WAVE_FIGURES:
-        if path := vars(arguments).pop(f"plot_{name}"):
-            with printed_on_failure(psf, arguments):
-                psf.plot(path, what=name, progress=options["progress"])
-            say(f"written: {path}")
-    return psf
-
-
-def _codesign(arguments: argparse.Namespace):
-    from raytrace.cli.codesign_run import run
-
-    return run(arguments)
-
-
-def _render(arguments: argparse.Namespace):
-    from raytrace.cli.render_run import render_files
-
-    return render_files(arguments)
-
-
-def _wave_design(arguments: argparse.Namespace):
-    from raytrace.cli.wave_run import design
-
-    return design(arguments)
-
-
-def _wave_restore(arguments: argparse.Namespace):
-    from raytrace.cli.wave_run import restore_files
-
-    return restore_files(arguments)
-
-
-def _mosaics():
-    from raytrace.imaging.sensor import PATTERNS
-
-    return ("none", *PATTERNS)
-
-
-def _psf_models():
-    from raytrace.psf_models import MODELS
-
-    return MODELS
-
-
-# -- the table
-
-_FILE = {"metavar": "FILE", "type": data_file}
 
 #: Subcommands of `raytrace wave`.
 WAVE_COMMANDS = (
@@ -322,26 +131,20 @@ The engine depends on the scene, its sampling on --tol; a sampling that would al
         --element cubic --focus 1000 --pixel 0.00369 --size 128 --exact -o cubic.npz
         --element heights.npy --glass F_SILICA --design-wavelength 0.55 --levels 16 --plot made.png
         --element ideal --depth 500 --engine fresnel --samples 2500 --json""",
-        element, camera(), light(), pixels(), engine, json,
+        element, camera(), light(), pixels(), ENGINE, "json",
         output(
             "arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, engine, "
-            "error", (".npz",),
+            "error", file_of(".npz"),
         ),
         plot("the kernels"),
         group("more figures", *(
-            plot(what, flag=f"--{name}", dest=f"plot_{name}") for name, what in _WAVE_FIGURES.items()
+            plot(content, f"plot_{name}", flag=f"--{name}") for name, content in _WAVE_FIGURES.items()
         )),
-        run=_wave_psf,
+        "max_bytes", run="cli.runs:wave_psf",
     ),
-    _of_module("wave-design", wave_design, _wave_design),
-    _of_module("wave-restore", wave_restore, _wave_restore),
+    _of_module("wave-design", wave_design, "cli.wave_run:design"),
+    _of_module("wave-restore", wave_restore, "cli.wave_run:restore_files"),
 )  # fmt: skip
-
-
-def _subcommands(parser: argparse.ArgumentParser) -> None:
-    children = parser.add_subparsers(dest="subcommand", metavar="SUB", required=True)
-    for command in WAVE_COMMANDS:
-        command.add_to(children, command.name.removeprefix("wave-"))
 
 
 #: All commands, in the order of the help page.
@@ -355,7 +158,7 @@ COMMANDS = (
         lenses/double_gauss.zmx --object-distance 25000 --f-number 4
         lens.zmx --json | python3 -m json.tool
         lens.zmx -o prescription.csv""",
-        lens, conditions, table,
+        *LENS, CONDITIONS, TABLE,
     ),
     _command(
         "check",
@@ -365,7 +168,7 @@ COMMANDS = (
         """
         lens.zmx
         lens.zmx --strict --json""",
-        lens, run=_check,
+        *LENS, "strict", run="cli.runs:check",
     ),
     _command(
         "convert",
@@ -375,16 +178,10 @@ COMMANDS = (
         lenses/double_gauss.zmx double_gauss.csv
         table.txt lens.zmx
         lens.zmx lens.seq""",
-        catalog, json, run=_convert,
-        source={
-            "flags": ("source",), "metavar": "IN", "type": file_name,
-            "help": "lens file, or the name of a shipped lens",
-        },
-        target={
-            "flags": ("target",), "metavar": "OUT", "type": file_of(LENS_SUFFIXES),
-            "help": "lens file to write: .zmx, .seq, .csv, .tsv, .txt",
-        },
-        strict="fail on anything unknown or assumed in IN",
+        Option("source", file_name, "IN", "lens file, or the name of a shipped lens", flag="source"),
+        Option("target", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", flag="target"),
+        "catalog", "json", row("strict", "fail on anything unknown or assumed in IN"), "configuration", "substitute",
+        "max_bytes", run="cli.runs:convert",
     ),
     _command(
         "layout",
@@ -396,8 +193,13 @@ COMMANDS = (
         folded_relay --view 3d --plot relay.png
         spectrometer --wavelength 0.45 0.55 0.65
         scanner.zmx --configuration all --plot scan.png""",
-        partial(lens, all_configurations="in one figure, superimposed"), conditions,
-        plot("the cross section (default LENS_layout.png in this folder)"), run=_layout,
+        "lens",
+        row("configuration", f"{OPTIONS['configuration'].help}; all: in one figure, superimposed", reader=count_or_all),
+        *LENS[2:], CONDITIONS, plot("the cross section (default LENS_layout.png in this folder)"), "fields",
+        Option("rays", count, "N", "of each fan, in the plane that is shown", default=7),
+        Option("view", help="yz (from the side), xz (from above) or 3d (in space)", choices=("yz", "xz", "3d"),
+            default="yz"),
+        run="cli.runs:layout",
     ),
     _command(
         "spot",
@@ -410,11 +212,19 @@ COMMANDS = (
         lens.zmx --object-distance 25000 --field 0 10 14 --json
         double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
         double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
-        lens, conditions, plot("the spot diagram"),
-        output("table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status", (".csv", "")),
-        run=_spot, rays={"type": many},
-        max_bytes="memory limit, as 200MB (default with --rays 256MB, else half of the free memory)",
-        **PUPIL,
+        *LENS, CONDITIONS, plot("the spot diagram"),
+        output("table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status",
+            file_of(".csv", "")),
+        "fields", *PUPIL,
+        Option("rays", many, "N", "instead of --points, any number of sobol or random rays for each field and "
+            "wavelength, traced in chunks of at most --max-bytes (default 256MB), none kept and nothing "
+            "differentiated"),
+        Option("reference", help="radii about the centroid or the chief ray of the primary wavelength",
+            choices=("centroid", "chief"), default="centroid"),
+        Option("weights", help="of rays, by their share of the pupil's area, or all equal; OpticStudio's spots are "
+            "--sampling hexapolar, --rings 6, --weights equal, --reference chief", choices=("area", "equal"),
+            default="area"),
+        run="cli.runs:spot",
     ),
     _command(
         "focus",
@@ -424,13 +234,16 @@ COMMANDS = (
         """
         lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
         lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
-        lens, partial(conditions, several="several are focused together"),
+        *LENS, conditions("several are focused together"),
         plot("the through-focus curve, the spots before and after, and the layout"),
-        option(
-            "--by", dest="plot_by", choices=("field", "wavelength"),
-            help="draw only the through-focus curves, one for each field, or for each wavelength of the first field",
-        ),
-        output("lens file to write with the new sensor distance"), run=_focus, **PUPIL,
+        Option("plot_by", help="draw only the through-focus curves, one for each field, or for each wavelength of the "
+            "first field", flag="--by", choices=("field", "wavelength")),
+        output("lens file to write with the new sensor distance", lens_file),
+        "distance_weights", "fields", "field_weights", "wavelength_weights",
+        Option("criterion", help="rms (minimum RMS spot radius, in closed form and differentiable), paraxial (image, "
+            "or the weighted mean of those of several objects) or mean (minimum mean distance from the centroid)",
+            choices=("rms", "paraxial", "mean"), default="rms"),
+        *PUPIL, run="cli.runs:focus",
     ),
     _command(
         "optimize",
@@ -448,22 +261,21 @@ COMMANDS = (
         double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
-        group("stopping", parameters(
-            "optimize", "cycles", "seconds", "paths",
-            cycles={"help": "maximum, including those before --resume (default 500)"},
-            paths={"help": "damping strategies to try"},
-        )),
-        group("files", parameters(
-            "optimize", "log", "checkpoint", "resume",
-            log={**_FILE, "help": "write a line for every cycle (.csv)"},
-            checkpoint={**_FILE, "help": "store the state of the search there (.json)"},
-            resume={
-                "metavar": "FILE", "type": file_name,
-                "help": "resume from a checkpoint of the same lens, variables and merit function",
-            },
-        )),
-        plot("the lens, its spots and its merit function, before and after"), output("lens file to write"),
+        *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
+        group(
+            "stopping",
+            Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
+            "seconds",
+            Option("paths", count, "N", "damping strategies to try", default=1),
+        ),
+        group(
+            "files",
+            Option("log", data_file, "FILE", "write a line for every cycle (.csv)"),
+            Option("checkpoint", data_file, "FILE", "store the state of the search there (.json)"),
+            Option("resume", file_name, "FILE", "resume from a checkpoint of the same lens, variables and merit "
+                "function"),
+        ),
+        plot("the lens, its spots and its merit function, before and after"), output("lens file to write", lens_file),
     ),
     _command(
         "search",
@@ -482,16 +294,15 @@ COMMANDS = (
         cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
-        lens, row("ray_aiming"), *MERIT, FREEDOM, AS_BUILT,
-        group("extent", parameters(
-            "search", "starts", "insert", "seconds", "seed",
-            starts={"help": "initial designs (default 64)"},
-            insert={
-                "metavar": "SURFACE", "type": count, "nargs": "*", "action": None,
-                "help": "instead of starts: insert a thin meniscus at every surface, or at these",
-            },
-            seed={"help": "of starts and hops"},
-        )),
+        *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
+        group(
+            "extent",
+            Option("starts", count, "N", "initial designs (default 64)"),
+            Option("insert", count, "SURFACE", "instead of starts: insert a thin meniscus at every surface, or at "
+                "these", nargs="*"),
+            "seconds",
+            row("seed", "of starts and hops"),
+        ),
         plot("the best lenses side by side"),
         output_folder("folder for lens files and their table; a search stored there resumes"),
     ),
@@ -506,8 +317,8 @@ COMMANDS = (
         double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
         tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
         zoom.zmx --configuration 2 --skip-unknown""",
-        lens, conditions, *MERIT, plot("the contributions to the merit, by operand and field"), table,
-        each="list every row, also the rays of one field",
+        *LENS, CONDITIONS, *MERIT, plot("the contributions to the merit, by operand and field"), TABLE,
+        switch("each", "list every row, also the rays of one field"),
     ),
     _command(
         "jacobian",
@@ -520,19 +331,12 @@ COMMANDS = (
         cooke_triplet --grade precision --of paths
         lens.zmx --of paths --field 0 10 -o derivatives.json
         double_gauss --vary curvature --of merit --merit spot""",
-        lens,
-        conditions,
-        option("--vary", metavar="WHAT", nargs="+", help="variables, pickups and solves (default: the file's)"),
-        option(
-            "--of",
-            metavar="QUANTITY",
-            choices=("landing points", "directions", "paths", "merit"),
-            help="'landing points' (default), directions, paths or merit",
-        ),
-        option("--merit", metavar="KIND", help="of --of merit: spot, wavefront or angular (default: the file's)"),
-        table,
-        grade={"help": "errors of manufacture by the tolerances of a published grade, as of `tolerance`"},
-        limits={"metavar": "NAME=LIMIT", "help": "errors by kind and limit, as of `tolerance`"},
+        *LENS, CONDITIONS, row("vary", "variables, pickups and solves (default: the file's)"),
+        Option("of", None, "QUANTITY", "'landing points' (default), directions, paths or merit",
+            choices=("landing points", "directions", "paths", "merit")),
+        Option("merit", None, "KIND", "of --of merit: spot, wavefront or angular (default: the file's)"), TABLE,
+        row("grade", "errors of manufacture by the tolerances of a published grade, as of `tolerance`"),
+        row("limits", "errors by kind and limit, as of `tolerance`", default=""), "fields",
     ),
     _command(
         "view",
@@ -544,11 +348,9 @@ COMMANDS = (
         """
         cooke_triplet
         lens.zmx --port 8765 --no-browser""",
-        lens,
-        conditions,
-        option("--port", metavar="N", type=count, default=0, help="port of the server (default: a free one)"),
-        option("--no-browser", dest="browser", action="store_false", help="print the address, open no browser"),
-        run=_view,
+        *LENS, CONDITIONS, Option("port", count, "N", "port of the server (default: a free one)"),
+        switch("browser", "print the address, open no browser", flag="--no-browser", default=True),
+        run="cli.runs:view",
     ),
     _command(
         "trace",
@@ -562,13 +364,11 @@ COMMANDS = (
         """
         double_gauss --field 0 14 0,-7
         lens.zmx --rays rays.csv -o traced.csv""",
-        lens, output("table to write (.csv); default: standard output", (".csv", ".txt", "")),
-        partial(conditions, several="rays from each"), run=_trace,
-        rays={
-            "metavar": "CSV", "type": file_name,
-            "help": "rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; by default the "
-            "chief and marginal rays of every field",
-        },
+        *LENS, output("table to write (.csv); default: standard output", file_of(".csv", ".txt", "")),
+        conditions("rays from each"),
+        Option("rays", file_name, "CSV", "rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional "
+            "wavelength; by default the chief and marginal rays of every field"),
+        "fields", run="cli.runs:trace",
     ),
     _command(
         "psf",
@@ -582,28 +382,24 @@ COMMANDS = (
         double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
         double_gauss --model drt --rays 256 --json
         double_gauss --model drt --rays 1e8 --max-bytes 200MB -o psf.npz""",
-        lens, partial(conditions, several="one row of kernels each"),
-        option(
-            "--rho", metavar="R", type=positive_finite,
-            help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform "
-            "disc)",
-        ),
+        *LENS, conditions("one row of kernels each"),
+        Option("rho", positive_finite, "R", "of the paraxial model: σ over the radius of the blur (default 0.5, the "
+            "second moment of a uniform disc)"),
         exclusive(
-            parameters("psf", "tol", tol={"help": "bound on the estimated error (default 0.01)"}),
-            option(
-                "--rays", metavar="N", type=many,
-                help="rays per kernel instead of a tolerance; with --model drt and --max-bytes any number of them",
-            ),
+            "tol",
+            Option("rays", many, "N", "rays per kernel instead of a tolerance; with --model drt and --max-bytes any "
+                "number of them"),
         ),
-        output(
-            "arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], pixel_pitch, "
-            "energy, error, wavelengths, model", (".npz",),
-        ),
-        plot("the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"), log,
-        pixel="pixel pitch (default 0.005)",
-        size="pixels across the window of the PSF (default 21)",
-        center="centre of the window: the chief ray (default), the optical axis or the centroid of the rays",
-        per_wavelength="a kernel for each wavelength instead of their weighted sum",
+        output("arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], "
+            "pixel_pitch, energy, error, wavelengths, model", file_of(".npz")),
+        plot("the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"), "plot_log",
+        "model", "fields", "wavelength_weights", "pixel",
+        row("size", "pixels across the window of the PSF (default 21)"),
+        Option("center", help="centre of the window: the chief ray (default), the optical axis or the centroid of the "
+            "rays", choices=("axis", "chief", "centroid")),
+        Option("normalise", help="energy (1 = all light through the entrance pupil) or window (each kernel sums to 1)",
+            choices=("energy", "window"), default="energy"),
+        switch("per_wavelength", "a kernel for each wavelength instead of their weighted sum"),
     ),
     _command(
         "render",
@@ -621,59 +417,62 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         double_gauss photo.png --sensor 36x24 --f-number 2.8 --mosaic RGGB --full-well 3e4 --bits 12 -o raw.png
         tessar near_far.png --depth map.png --depth-range 800 5000 --planes 6 -o rendered.png
         phone a.jpg b.jpg --no-distortion --no-illumination -o folder --json""",
-        lens,
-        option("picture", metavar="PICTURE", type=file_name, nargs="+", help="pictures to render, sRGB levels"),
-        partial(conditions, several="one result after the other, in files named by the distance"),
-        option("-o", "--output", metavar="OUT", type=picture_or_folder,
-            help="picture to write: .png, sRGB; .tif or .npy, light; of several pictures a folder of .png files"),
-        option("--png-bits", metavar="N", type=int, choices=(8, 16), default=8, help="of a .png file (default 8)"),
-        option("--raw", action="store_true", help="write the mosaic that the sensor records (.tif, .npy)"),
-        option("--compare", "--plot", dest="plot", metavar="FILE", type=picture_file,
-            help="save the pictures of an ideal lens and of this one, whole and in detail, as .png, .pdf or .svg"),
+        *LENS, Option("picture", file_name, "PICTURE", "pictures to render, sRGB levels", flag="picture", nargs="+"),
+        conditions("one result after the other, in files named by the distance"),
+        Option("output", picture_or_folder, "OUT", "picture to write: .png, sRGB; .tif or .npy, light; of several "
+            "pictures a folder of .png files", flag="-o --output"),
+        Option("png_bits", int, "N", "of a .png file", choices=(8, 16), default=8),
+        switch("raw", "write the mosaic that the sensor records (.tif, .npy)"),
+        plot("the pictures of an ideal lens and of this one, whole and in detail,", flag="--compare --plot"),
         group(
             "the sensor",
-            option("--sensor", metavar="WxH", type=extent,
-                help="width and height in mm, as 24x16 (default: the largest field of the lens in the corners)"),
-            option("--offset", metavar=("X", "Y"), type=finite, nargs=2,
-                help="of its centre from the optical axis, mm (default 0 0)"),
-            option("--response", metavar="NAME",
-                help="rgb, grey, a table wavelength_nm,r,g,b (.csv), or a measured camera: 'Nikon 5100 (NPL)', 'Sigma "
-                "SDMerill (NPL)' (default rgb of coloured pictures, grey of grey ones)"),
-            option("--mosaic", choices=Names(_mosaics), metavar="PATTERN",
-                help="Bayer pattern: RGGB, BGGR, GRBG or GBRG (default none)"),
-            option("--full-well", metavar="E", type=positive_finite, help="electrons of white: adds shot noise"),
-            option("--read-noise", metavar="E", type=not_negative,
-                help="standard deviation in electrons; without --full-well a fraction of white"),
-            option("--bits", metavar="N", type=count, help="bits of the quantisation, before those of the file"),
-            option("--black-level", metavar="E", type=not_negative,
-                help="offset of the quantisation, unit of --read-noise (default five times that)"),
-            row("seed", default=0, help="of the noise, which differs from picture to picture"),
+            Option("sensor", extent, "WxH", "width and height in mm, as 24x16 (default: the largest field of the lens "
+                "in the corners)"),
+            Option("offset", finite, ("X", "Y"), "of its centre from the optical axis, mm (default 0 0)", nargs=2),
+            Option("response", None, "NAME", "rgb, grey, a table wavelength_nm,r,g,b (.csv), or a measured camera: "
+                "'Nikon 5100 (NPL)', 'Sigma SDMerill (NPL)' (default rgb of coloured pictures, grey of grey ones)"),
+            Option("mosaic", None, "PATTERN", "Bayer pattern: RGGB, BGGR, GRBG or GBRG (default none)",
+                choices=("none", "RGGB", "BGGR", "GRBG", "GBRG")),
+            Option("full_well", positive_finite, "E", "electrons of white: adds shot noise"),
+            Option("read_noise", not_negative, "E", "standard deviation in electrons; without --full-well a fraction "
+                "of white"),
+            Option("bits", count, "N", "bits of the quantisation, before those of the file"),
+            Option("black_level", not_negative, "E", "offset of the quantisation, unit of --read-noise (default five "
+                "times that)"),
+            row("seed", "of the noise, which differs from picture to picture"),
         ),
         group(
             "depth",
-            option("--depth", metavar="MAP", type=file_name,
-                help="distance of every pixel from surface 1: an array of mm (.npy), or a grey picture, dark is near"),
-            option("--depth-range", metavar=("NEAR", "FAR"), type=positive_finite, nargs=2,
-                help="mm of black and of white of the picture MAP, linear between them"),
-            option("--background", metavar="PICTURE", type=file_name,
-                help="the scene behind the objects, without them (default: it continues as around them)"),
-            parameters("render", "planes", planes={
-                "help": "layers, at equally spaced reciprocal distances; near ones cover far ones",
-            }),
+            Option("depth", file_name, "MAP", "distance of every pixel from surface 1: an array of mm (.npy), or a "
+                "grey picture, dark is near"),
+            Option("depth_range", positive_finite, ("NEAR", "FAR"), "mm of black and of white of the picture MAP, "
+                "linear between them", nargs=2),
+            Option("background", file_name, "PICTURE", "the scene behind the objects, without them (default: it "
+                "continues as around them)"),
+            Option("planes", count, "N", "layers, at equally spaced reciprocal distances; near ones cover far ones",
+                default=8),
+            Option("softness", not_negative, "SHARE", "of the transition between layers, a logistic function of so "
+                "large a share of the difference of their reciprocal distances", default=0.0),
         ),
-        group("left out", parameters(
-            "render", "distortion", "lateral_colour", "illumination",
-            distortion={"help": "no distortion: the image of an ideal lens, blurred"},
-            lateral_colour={"help": "no lateral colour: the kernels of all wavelengths are centred on one chief ray"},
-            illumination={"help": "no relative illumination: as bright in the corners as on the axis"},
-        )),
-        run=_render,
-        model={"choices": Names(_psf_models),
-            "help": "of the PSF: paraxial, fourier, gaussian, drt or wave, in order of fidelity (default: the first of "
-            "the last three that differs from the next by less than --tol)"},
-        tol="bound on the estimated error of the kernels, of the light of a point",
-        boundary={"choices": ("reflect", "zero"),
-            "help": "the scene beyond the edge of the picture: reflect, its mirror image, or zero, black"},
+        group(
+            "left out",
+            switch("distortion", "no distortion: the image of an ideal lens, blurred", flag="--no-distortion",
+                default=True),
+            switch("lateral_colour", "no lateral colour: the kernels of all wavelengths are centred on one chief ray",
+                flag="--no-lateral-colour", default=True),
+            switch("illumination", "no relative illumination: as bright in the corners as on the axis",
+                flag="--no-illumination", default=True),
+        ),
+        group(
+            "kernels",
+            row("model", "of the PSF: paraxial, fourier, gaussian, drt or wave, in order of fidelity (default: the "
+                "first of the last three that differs from the next by less than --tol)", choices=MODELS),
+            row("tol", "bound on the estimated error of the kernels, of the light of a point", default=0.01),
+            row("size", "pixels across their window, an odd number, by default as many as hold the light"),
+            Option("boundary", help="the scene beyond the edge of the picture: reflect, its mirror image, or zero, "
+                "black", choices=("reflect", "zero"), default="reflect"),
+        ),
+        run="cli.render_run:render_files",
     ),
     _command(
         "compare",
@@ -687,15 +486,17 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         lenses/double_gauss.zmx --plot compare.png
         double_gauss --start rms --json""",
-        lens,
+        *LENS,
         group(
             "conditions other than the file's",
-            object_distance("the columns (default 10000 20000 30000 40000 50000)"),
-            aperture, row("wavelengths"), row("ray_aiming"),
+            object_distance("the columns (default 10000 20000 30000 40000 50000)"), APERTURE, "wavelengths",
+            "ray_aiming",
         ),
-        plot("the grid of kernels"), log,
-        focus_distance="object in focus", pixel="pixel pitch (default 0.005)",
-        size="pixels across the windows (default 21)",
+        plot("the grid of kernels"), "plot_log",
+        Option("focus_distance", positive, "MM", "object in focus", default=25e3),
+        Option("start", help="sensor position, the paraxial image or the minimum RMS spot radius on the axis",
+            choices=("paraxial", "rms"), default="paraxial"),
+        row("pixel", default=0.005), row("size", default=21),
     ),
     _command(
         "glass",
@@ -709,61 +510,35 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         SK16 --wavelength 0.53 --json
         N-BK7 --temperature 40 --pressure 0
         MYGLASS --catalog my_glasses.agf""",
-        catalog, json, run=_with_catalogs,
-        name={
-            "flags": ("name",), "metavar": "NAME",
-            "help": "name of a glass, as in a lens file, or a six-digit MIL code",
-        },
-        wavelengths="wavelengths in µm (default: F d C)",
+        Option("name", None, "NAME", "name of a glass, as in a lens file, or a six-digit MIL code", flag="name"),
+        "catalog", "json", row("wavelengths", "wavelengths in µm (default: F d C)"), "temperature", "pressure",
+        "max_bytes", run="cli.runs:glass",
     ),
     _command(
         "bench",
         "measure speed against error",
-        "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference; every "
-        "PSF model at every sampling against converged kernels (minutes); or the speed of the trace over batch sizes, "
-        "with gradients, aspheres and the step of the sensor distance (minutes); or Cooke triplets perturbed and "
-        "refocused; or pictures rendered through one, and steps of training. With the extra [bench] Optiland and "
-        "ray-optics are measured, too.",
+        "Measure on this machine, for lenses of your own: the trace, forward and with gradient, in float32 and float64 "
+        "(trace); every PSF model at every sampling against converged kernels, on the axis and at the largest field "
+        "(psf, minutes); or a training step of a camera and pictures of 12 megapixels against direct superposition "
+        "(camera, minutes).",
         """
         trace
-        psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
-        trace --rays 1000 100000 -o bench.md --plot bench.png
-        speed --quick --repeats 1
-        tolerance --json
-        camera -o camera.md --plot camera.png""",
-        option("what", choices=("trace", "psf", "speed", "tolerance", "camera"), help="subject of the measurement"),
-        option(
-            "lenses",
-            metavar="LENS",
-            type=file_name,
-            nargs="*",
-            help="psf: lenses to measure, on the axis and at the largest field "
-            "(default double_gauss phone hubble, in predefined conditions)",
-        ),
-        json,
-        option("--lens", metavar="LENS", help="trace: lens to trace (default double_gauss)"),
-        option(
-            "--rays",
-            metavar="N",
-            type=count,
-            nargs="+",
-            help="trace: numbers of rays (default 1000 10000 100000 1000000)",
-        ),
-        option("--device", metavar="NAME", help="trace: device to trace on as well, such as cuda"),
-        option("--repeats", metavar="N", type=count, default=5, help="runs, whose median is reported"),
-        option("--threads", metavar="N", type=count, help="threads of torch"),
-        option("--no-peers", action="store_true", help="leave out Optiland even if it is installed"),
-        output("report to write (.md)", (".md",)),
-        option("--csv", metavar="FILE", type=output_file, help="psf: table to write, one line for each measurement"),
-        option(
-            "--docs",
-            metavar="DOCS",
-            type=folder_name,
-            help="speed: folder for speed.md, speed.csv and speed.png",
-        ),
-        option("--quick", action="store_true", help="speed: few rays, as a trial; the ratios are not meaningful"),
-        plot("speed over number of rays, or time over error,"),
-        run=_bench,
+        trace tessar --rays 1000 100000 -o trace.csv --plot trace.png
+        psf double_gauss phone -o psf.csv --plot psf.png
+        camera double_gauss --sensor 36x24 --json""",
+        Option("what", help="subject of the measurement", flag="what", choices=("trace", "psf", "camera")),
+        Option("lenses", file_name, "LENS", "one lens, of psf any number (default: trace double_gauss, psf "
+            "double_gauss phone, camera cooke_triplet)", flag="lenses", nargs="*"),
+        "json",
+        Option("rays", count, "N", "trace: numbers of rays (default 1000 10000 100000 1000000)", nargs="+"),
+        Option("device", None, "NAME", "trace: device to trace on as well, such as cuda"),
+        Option("sensor", extent, "WxH", "camera: width and height in mm, as 24x16 (default: the largest field of the "
+            "lens in the corners)"),
+        Option("repeats", count, "N", "runs, whose median is reported", default=5),
+        Option("threads", count, "N", "threads of torch"),
+        TABLE,
+        plot("speed over number of rays (trace), or time over error (psf),"),
+        "max_bytes", run="bench.command:run",
     ),
     _command(
         "mtf",
@@ -774,7 +549,14 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         double_gauss --object-distance 25000 --plot mtf.png
         tessar --frequency 10 20 40 --geometric --json
         tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        Option("frequencies", positive_finite, "F", "cycles/mm, by default 41 from 0 to the resolution of the sharpest "
+            "field, at most half of the diffraction cutoff", flag="--frequency", nargs="+"),
+        Option("geometric", help="of rays alone, or always of diffraction; by default of diffraction, except for a "
+            "field that would need more than 1280 points across the pupil or a trace of more than 1.5 s, and whose "
+            "modulation diffraction is predicted to change by at most 1e-3 at every frequency: that field is "
+            "geometric, as by_rays reports", action=argparse.BooleanOptionalAction),
+        Option("through_focus", positive_finite, "MM", "move the sensor by ± this, mm, at one frequency"), "fields",
     ),
     _command(
         "ray-fan",
@@ -783,7 +565,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot fan.png
         double_gauss --field 0 14 -10,5 --points 21 --json""",
-        lens, conditions, plot("the fans"), table,
+        *LENS, CONDITIONS, plot("the fans"), TABLE,
+        "fields", row("points", "rays across the pupil, odd to have the chief ray among them", default=41),
     ),
     _command(
         "opd-fan",
@@ -793,7 +576,11 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot opd.png
         double_gauss --object-distance 25000 --reference own --json""",
-        lens, conditions, plot("the fans"), table,
+        *LENS, CONDITIONS, plot("the fans"), TABLE,
+        "fields", row("points", "rays across the pupil", default=41),
+        Option("reference", help="the sphere, primary: about the point of the primary wavelength for all, so that "
+            "lateral colour shows as tilt and axial colour as defocus; own: about each wavelength's own point, which "
+            "takes lateral colour out", choices=("primary", "own"), default="primary"),
     ),
     _command(
         "wavefront",
@@ -805,7 +592,11 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         tessar --plot wavefront.png
         double_gauss --field 0 14 --numbering fringe --terms 16
         double_gauss --field 0 --json""",
-        lens, conditions, plot("the maps"), table,
+        *LENS, CONDITIONS, plot("the maps"), TABLE,
+        "fields", row("size", "pixels across a map", default=127),
+        Option("terms", count, "N", "number of Zernike terms, 37 by default"),
+        Option("numbering", help="noll (default) or fringe; the text lists the coefficients where one of them is given",
+            choices=("noll", "fringe")),
     ),
     _command(
         "distortion",
@@ -814,7 +605,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         phone --plot distortion.png
         double_gauss --field 5 10 14 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples",
     ),
     _command(
         "field-curvature",
@@ -823,7 +615,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot curvature.png
         double_gauss --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples",
     ),
     _command(
         "lateral-colour",
@@ -832,7 +625,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot lateral.png
         double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples",
     ),
     _command(
         "relative-illumination",
@@ -841,7 +635,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         phone --plot illumination.png
         double_gauss --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples",
     ),
     _command(
         "seidel",
@@ -852,7 +647,12 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot seidel.png -o seidel.csv
         double_gauss --kind waves --field 10 14 --json""",
-        lens, conditions, plot("a bar for each surface"), table,
+        *LENS, CONDITIONS, plot("a bar for each surface"), TABLE,
+        "fields",
+        Option("kind", help="coefficients: S1 … S5, C1, C2 in mm. waves: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P "
+            "= S4/4, W311 = S5/2, W020 = C1/2, W111 = C2. transverse: mm by which rays of the rim miss the paraxial "
+            "image point, the upper one where there is a choice. longitudinal: mm along z from the paraxial focus to "
+            "theirs", choices=("coefficients", "waves", "transverse", "longitudinal"), default="coefficients"),
     ),
     _command(
         "longitudinal-aberration",
@@ -861,7 +661,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot longitudinal.png
         cooke_triplet --wavelength 0.55 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        row("points", "rays from the axis to the rim of the pupil", default=41),
     ),
     _command(
         "chromatic-focal-shift",
@@ -870,7 +671,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         cemented_achromat --plot shift.png
         singlet --wavelength 0.45 0.65 --json""",
-        lens, conditions, plot("the curve"), table, samples="wavelengths of the curve",
+        *LENS, CONDITIONS, plot("the curve"), TABLE,
+        row("samples", "wavelengths of the curve", default=101),
     ),
     _command(
         "distortion-grid",
@@ -879,12 +681,10 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         phone --plot grid.png --exaggerate 10
         retrofocus --points 5 --json""",
-        lens, conditions, plot("the ideal and the real grid"), table,
-        option(
-            "--exaggerate", dest="plot_exaggerate", metavar="N", type=positive_finite, default=1.0,
-            help="draw the distortion N times as large",
-        ),
-        points="points across the grid",
+        *LENS, CONDITIONS, plot("the ideal and the real grid"), TABLE,
+        Option("plot_exaggerate", positive_finite, "N", "draw the distortion N times as large", flag="--exaggerate",
+            default=1.0),
+        row("points", "points across the grid", default=11),
     ),
     _command(
         "incidence",
@@ -893,7 +693,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         phone --plot incidence.png
         double_gauss --field 0 14 --surfaces --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples", switch("surfaces", "list every surface in the text, not only the sensor"),
     ),
     _command(
         "rms-over-field",
@@ -903,7 +704,11 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot rms.png
         double_gauss --spot --field 0 10 14 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        "fields", "samples", switch("spot", "RMS spot radius about the centroid instead"),
+        Option("reference", help="centres of the reference spheres of the wavelengths together, the primary one's "
+            "chief ray, so that lateral colour counts, or each one's own", choices=("primary", "own"),
+            default="primary"),
     ),
     _command(
         "encircled-energy",
@@ -912,7 +717,10 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         """
         tessar --plot encircled.png
         double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
-        lens, conditions, plot("the curves"), table,
+        *LENS, CONDITIONS, plot("the curves"), TABLE,
+        Option("radii", positive_finite, "MM", "about the centroid of the rays, mm, by default from 0 to almost all of "
+            "the light", flag="--radius", nargs="+"),
+        switch("geometric", "of rays alone, without diffraction"), "fields",
     ),
     _command(
         "tolerance",
@@ -929,18 +737,41 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         double_gauss --grade commercial --save-trials built
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
-        lens, conditions, plot("histogram, yield and the tolerances that count most"), table,
-        option(
-            "--save-trials", metavar="FOLDER", type=folder_name,
-            help="write the lenses of the typical, the worst and the best trial there, as .zmx files",
-        ),
-        run=_tolerance,
-        rings={"help": "rings of the pupil (default 4)"}, checkpoint=_FILE, trials={"type": count_or_none},
-        model={"choices": ("gaussian", "drt"), "help": "PSFs of psf: gaussian (default), smooth in the errors, or drt"},
-        pixel="pixel pitch of psf (default 0.005)", size="pixels across the windows of psf (default 21)",
-        limits={"metavar": "NAME=LIMIT"},
+        *LENS, CONDITIONS, plot("histogram, yield and the tolerances that count most"), TABLE,
+        Option("save_trials", folder_name, "FOLDER", "write the lenses of the typical, the worst and the best trial "
+            "there, as .zmx files"),
+        row("grade", "tolerances of a published grade instead of the file's"),
+        row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
+            "those of the file or the grade, and index=0 leaves one out", default=""),
+        Option("criterion", help="rms, the RMS spot radius in µm over fields and wavelengths by their "
+            "weights, each field about the centroid of its light, of an afocal lens that of angle, the RMS angle in "
+            "mrad of the rays; wavefront, the RMS wavefront in waves less mean and tilt; mtf@30, the MTF of "
+            "diffraction at 30 cycles/mm, mean of tangential and sagittal over the fields; psf, the change of the "
+            "PSFs, √(Σ(h - h₀)²/Σh₀²) with h₀ of the nominal lens, mean square over the fields, in windows about the "
+            "chief ray; boresight, the distance in µm by which the chief ray of the axial field misses its nominal "
+            "place on the sensor; merit, a merit function", default="rms"),
+        Option("trials", count_or_none, "N", "number of perturbed and compensated lenses, 0 for none", default=1000),
+        row("seed", "seed of random numbers"),
+        Option("increment", positive_finite, "CHANGE", "inverse sensitivity: limits are tightened until no error "
+            "alone, at a limit, makes the criterion worse by more than this, in its unit"),
+        Option("goal", positive_finite, "VALUE", "largest criterion of a good lens, for an MTF the smallest; the share "
+            "of such lenses is reported"),
+        Option("yield_", positive_finite, "SHARE", "a share of the lenses, 0.9 by default, whose criterion is "
+            "reported; with --goal, limits are tightened at least total tightness until this share reaches the goal, "
+            "by second order corrected by traced lenses", flag="--yield"),
+        "fields", row("rings", "rings of the pupil (default 4)"),
+        Option("arms", count, "N", "of the pupil, 4·rings by default"),
+        Option("light_loss", positive_finite, "SHARE", "share of the light of the nominal lens that a lens may lose; "
+            "a lens that loses more has failed", default=0.05),
+        Option("model", None, "MODEL", "PSFs of psf: gaussian (default), smooth in the errors, or drt",
+            choices=("gaussian", "drt"), default="gaussian"),
+        row("pixel", "pixel pitch of psf (default 0.005)"),
+        row("size", "pixels across the windows of psf (default 21)"),
+        Option("checkpoint", data_file, "FILE", "a file (.jsonl) of finished trials, from which an interrupted study "
+            "resumes"),
+        run="cli.runs:tolerance",
     ),
-    _of_module("codesign", codesign, _codesign),
+    _of_module("codesign", codesign, "cli.codesign_run:run"),
     Command(
         "wave",
         "phase elements: PSFs, design, restoration",
@@ -952,6 +783,7 @@ interpolated. -o names a file, or a folder for several pictures, which share the
   raytrace wave psf --element fresnel --wavelength 0.46 0.55 0.64 --json
   raytrace wave design --element smooth --starts 2 -o run --plot element.png
   raytrace wave restore scene.png --element run/heights.npy --simulate 500 -o simulated""",
-        (_subcommands,),
+        (),
+        subcommands=WAVE_COMMANDS,
     ),
 )  # fmt: skip

@@ -6,7 +6,7 @@
         ...
 
 `heartbeat` encloses every command: its thread writes the lines, so that they appear while a single step takes minutes
-and in commands that count nothing.
+and in commands without progress.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sized
+from typing import Any
 
 from tqdm import tqdm
 
@@ -25,10 +26,10 @@ _open: list["Bar | Lines"] = []  # running computations, the innermost last
 
 
 def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0) -> "Bar | Lines":
-    """The progress of some work: `update(n)`, `set_postfix_str(words)`, `close()`, as tqdm's; a context manager.
+    """Progress with the methods of tqdm: `update(n)`, `set_postfix_str(words)`, `close()`; a context manager.
 
-    work: the number of steps, None where it is not known, or what is to be gone through, which is then iterated over.
-    what: what is done, for people; unit: of the steps; initial: of them, those done before.
+    work: the number of steps, None if it is unknown, or an iterable, over whose items the progress then iterates. what:
+    the name of the computation; unit: of the steps; initial: number of steps that were done before.
     """
     items, total = _parts(work)
     if total is None or not _is_terminal():
@@ -58,14 +59,14 @@ def heartbeat(what: str) -> Iterator[None]:
 
 
 def silence() -> None:
-    """The command computes only when it is asked: `heartbeat` writes no lines."""
+    """Let `heartbeat` write no lines, for a command that computes on request alone."""
     _open.clear()
 
 
 class Bar(tqdm):
     """A bar, while which no lines are written."""
 
-    def __init__(self, *arguments, **keywords):
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         _open.append(self)
 
@@ -81,7 +82,8 @@ class Lines:
     """Progress in words: `tracing: 3/10 planes, 0:20 elapsed, about 0:47 left`."""
 
     def __init__(self, work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0):
-        self.items, self.total = _parts(work)
+        items, self.total = _parts(work)
+        self.items = () if items is None else items
         self.what, self.unit = what, unit
         self.n = self.initial = initial
         self.start_time, self.words = time.monotonic(), ""
@@ -102,7 +104,7 @@ class Lines:
     def __enter__(self) -> "Lines":
         return self
 
-    def __exit__(self, *error) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator:
@@ -128,7 +130,7 @@ def clock(seconds: float) -> str:
 
 
 def _parts(work: int | Iterable | None) -> tuple[Iterable | None, int | None]:
-    """What is gone through, and in how many steps, as far as is known."""
+    """The iterable and the number of steps, each None if unknown."""
     if not isinstance(work, Iterable):
         return None, work
     return work, len(work) if isinstance(work, Sized) else None

@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -65,16 +65,18 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
             else:
                 how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
                 rendering = rendering.another(load(), options["depth"], **how)
-            recorded = (rendering.recorded if arguments.raw else rendering.captured)(number, arguments.seed)
-        if targets[number] is not None:
-            targets[number].parent.mkdir(parents=True, exist_ok=True)
-            recorded.save(targets[number], arguments.png_bits)
-            say(f"written: {targets[number]}")
+            capture = rendering.recorded if arguments.raw else rendering.captured
+            recorded = capture(torch.tensor(number), arguments.seed)
+        target = targets[number]
+        if target is not None:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            recorded.save(target, arguments.png_bits)
+            say(f"written: {target}")
         if path := arguments.plot:
             path = Path(path) if len(files) == 1 else Path(path).with_stem(f"{Path(path).stem}_{Path(file).stem}")
             recorded.plot(path)
             say(f"written: {path}")
-        written = None if targets[number] is None else str(targets[number])
+        written = None if target is None else str(target)
         records.append({"file": str(file), "written": written, **recorded.document()})
         texts.append(str(recorded))
     arguments.plot = arguments.output = None
@@ -100,7 +102,7 @@ def _named(name: str) -> Iterator[None]:
         raise CommandError(f"{name}: {error}") from error
 
 
-def _targets(files: list[str], output: str | None) -> list[Path | None]:
+def _targets(files: list[str], output: str | None) -> Sequence[Path | None]:
     """The file to write of every picture."""
     if output is None:
         return [None] * len(files)

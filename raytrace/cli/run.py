@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import importlib
 import inspect
 import json
 import math
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias, TypeVar
 
 import raytrace
 from raytrace.cli.progress import progress
@@ -22,7 +24,7 @@ from raytrace.maths.result import Result
 from raytrace.psf_models import Execution, model_of
 from raytrace.shards import processes, share
 from raytrace.system.lens import Lens, check_media
-from raytrace.words import RaytraceError, did_you_mean
+from raytrace.words import RaytraceError, did_you_mean, option
 
 #: Options that set the lens, by the keywords of `Lens.at`.
 CONDITIONS = (
@@ -30,13 +32,17 @@ CONDITIONS = (
 )
 #: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.
 RUNNER_OPTIONS = (
-    *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "spelled"),
+    *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "flags"),
     "save_trials",
     *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
 #: Options that are fields of the parameter `execution`.
 _EXECUTION = tuple(field.name for field in dataclasses.fields(Execution))
-_FIGURE = "plot_"  # prefix of options of the figure: --log, dest="plot_log"
+Returned = TypeVar("Returned")
+Name = TypeVar("Name", bound=str)
+#: Carries out a command; None where it has printed or saved its result.
+Run: TypeAlias = Callable[[argparse.Namespace], Result | None]
+_FIGURE = "plot_"  # prefix of the names of options of the figure, as plot_log
 #: Outputs that may be an input: a checkpoint replaces the one that is resumed.
 _REPLACES = {("checkpoint", "resume")}
 
@@ -53,7 +59,7 @@ def carry_out(arguments: argparse.Namespace) -> int:
     """
     with processes() if _takes(arguments, "share") else nullcontext():
         check_outputs(arguments)
-        run = arguments.run.run or result_of_lens
+        run = _run_of(arguments)
         distances = getattr(arguments, "object_distances", None)
         if distances and not _takes(arguments, "object_distances"):
             return _run_each(run, arguments, distances)
@@ -62,7 +68,16 @@ def carry_out(arguments: argparse.Namespace) -> int:
         return int(result is not None and result.falls_short)
 
 
-def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[float]) -> int:
+def _run_of(arguments: argparse.Namespace) -> Run:
+    """The function that a command runs: that of its row, else its public function with a lens."""
+    command = arguments.run
+    if command.run:
+        module, _, name = command.run.partition(":")
+        return getattr(importlib.import_module(f"raytrace.{module}"), name)
+    return partial(result_of_lens, verb=raytrace.public_name(command.verb))
+
+
+def _run_each(run: Run, arguments: argparse.Namespace, distances: list[float]) -> int:
     """One result for each object distance; with several, files are named by the distance."""
     documents, falls_short, failure = [], False, None
     several = len(distances) > 1
@@ -78,6 +93,8 @@ def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[floa
         if several and not arguments.json:
             print(f"object at {text}", flush=True)
         result = run(single)
+        if result is None:
+            continue
         falls_short |= result.falls_short
         try:
             save(result, single)
@@ -88,7 +105,7 @@ def _run_each(run: Callable, arguments: argparse.Namespace, distances: list[floa
             documents.append({**place, **result.document()})
         else:
             print(result)
-    if arguments.json:
+    if documents:
         print_json({"results_by_object_distance": documents} if several else documents[0])
     if failure:
         raise failure
@@ -124,10 +141,10 @@ def options_of(arguments: argparse.Namespace) -> dict:
     return options
 
 
-def result_of_lens(arguments: argparse.Namespace) -> Result:
-    """Call the public function with the lens and the options. Its errors begin with the name of the lens.
+def result_of_lens(arguments: argparse.Namespace, verb: Callable[..., Returned]) -> Returned:
+    """Call a public function with the lens and the options. Its errors begin with the name of the lens.
 
-    Options that a function of a merit function has no parameters for define the merit function.
+    If the function takes a merit function, options that are not its parameters define the merit function.
     """
     lens, options = open_lens(arguments), options_of(arguments)
     try:
@@ -139,18 +156,17 @@ def result_of_lens(arguments: argparse.Namespace) -> Result:
                 from raytrace.optimization.merit import merit_of_options  # loads the package of merit functions
 
                 options["merit"] = merit_of_options(lens, **of_merit)
-        return raytrace.public_name(arguments.run.verb)(lens, **options)
+        return verb(lens, **options)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
 
 
 def _as_built(options: dict) -> dict:
-    """The keyword `as_built`, of the options of --as-built, which are taken out; none without it."""
+    """The keyword `as_built`, made of --as-built and its options, which are removed; empty without --as-built."""
     settings = {name: options.pop(name) for name in ("grade", "limits", "weight") if name in options}
     if not options.pop("as_built", False):
         if settings:
-            spelled = {"weight": "as-built-weight"}
-            raise CommandError(f"--{spelled.get(min(settings), min(settings))} goes with --as-built")
+            raise CommandError(f"{option(min(settings))} goes with {option('as_built')}")
         return {}
     from raytrace.tolerancing.as_built import AsBuilt  # loads the package of tolerances
 
@@ -224,17 +240,17 @@ def check_outputs(arguments: argparse.Namespace) -> None:
             raise CommandError(f"{flag} {path}: is the file of {_flag(arguments, other)} too; give another name")
         seen[_real(path)] = name
         try:
-            check_output(path, tuple(path.suffixes))
+            check_output(path, path.suffixes)
         except ValueError as error:
             raise CommandError(f"{flag} {error}") from error
-    for name, path in _paths(arguments, OutputFolder):
-        if path.may_be_file and _real(path) in seen:
-            other = _flag(arguments, seen[_real(path)])
-            raise CommandError(f"{_flag(arguments, name)} {path}: is the file of {other} too; give another name")
-        check_output_folder(Path(path).parent if path.may_be_file else path)
+    for name, folder in _paths(arguments, OutputFolder):
+        if folder.may_be_file and _real(folder) in seen:
+            other = _flag(arguments, seen[_real(folder)])
+            raise CommandError(f"{_flag(arguments, name)} {folder}: is the file of {other} too; give another name")
+        check_output_folder(Path(folder).parent if folder.may_be_file else folder)
 
 
-def _paths(arguments: argparse.Namespace, kind: type[str]) -> Iterator[tuple[str, str]]:
+def _paths(arguments: argparse.Namespace, kind: type[Name]) -> Iterator[tuple[str, Name]]:
     """Names and values of the arguments that are paths of a kind, single or in lists."""
     for name, value in vars(arguments).items():
         for entry in value if isinstance(value, list | tuple) else [value]:
@@ -248,13 +264,13 @@ def _real(path: str) -> str:
 
 
 def _flag(arguments: argparse.Namespace, name: str) -> str:
-    return getattr(arguments, "spelled", {}).get(name, name.upper())
+    return arguments.flags.get(name, name.upper())
 
 
-def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None:
+def refuse_suffix(flag: str, path: str | None, known: tuple[str, ...]) -> None:
     """Raise CommandError for a file name with another suffix than the known ones; None passes."""
     if path and Path(path).suffix.lower() not in known:
-        raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(filter(None, known))}")
+        raise CommandError(f"{flag} {path}: expected a name that ends in {', '.join(filter(None, known))}")
 
 
 # -- the result
@@ -290,10 +306,10 @@ def print_result(result: Result, arguments: argparse.Namespace) -> None:
 def save(result: Result, arguments: argparse.Namespace) -> None:
     """Write the figure of --plot and the data of -o."""
     drawing = {name.removeprefix(_FIGURE): value for name, value in vars(arguments).items() if name.startswith(_FIGURE)}
-    for option, write in (("plot", partial(result.plot, **drawing)), ("output", result.save)):
-        if path := getattr(arguments, option, None):
+    for name in ("plot", "output"):
+        if path := getattr(arguments, name, None):
             try:
-                write(path)
+                result.plot(path, **drawing) if name == "plot" else result.save(path)
             except raytrace.NothingToShow as error:
                 raise CommandError(f"{arguments.lens}: {error}") from error
             say(f"written: {path}")

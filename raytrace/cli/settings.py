@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from raytrace.cli.parameters import Parameter, add_parameter
-from raytrace.cli.types import count, file_name, folder_name, seed_number
+from raytrace.cli.options import with_default
+from raytrace.cli.types import count, file_name, folder_name, positive_finite, seed_number
 from raytrace.settings import Settings
 from raytrace.words import RaytraceError, did_you_mean
 
@@ -33,6 +33,13 @@ def option(
     )
 
 
+#: Arguments of `add_argument` by the type of a field.
+_KINDS: dict[type, dict] = {
+    bool: {"action": "store_true"},
+    int: {"type": count, "metavar": "N"},
+    float: {"type": positive_finite},
+    tuple: {"type": positive_finite, "nargs": "+"},
+}
 SEED = option("of random numbers", type=seed_number)
 
 
@@ -45,11 +52,14 @@ def add_options(
     """
     for name in names or rows:
         row, default = dict(rows[name]), defaults[name]
-        flags = (f"--{_spelled(name, row)}",)
+        flag = f"--{_spelled(name, row)}"
         del row["name"], row["unit"], row["between"]
-        kind = "Sequence[float]" if isinstance(default, tuple) else type(default).__name__
-        added = add_parameter(group, name, Parameter(kind, default), {"flags": flags, **row}, keep_default=False)
-        added.help = argparse.SUPPRESS if hidden else added.help
+        settings = _KINDS.get(type(default), {}) | row
+        if "action" not in settings:
+            settings["help"] = with_default(row["help"], default)
+        if hidden:
+            settings["help"] = argparse.SUPPRESS
+        group.add_argument(flag, dest=name, **{key: value for key, value in settings.items() if value is not None})
 
 
 # -- settings from a file ----------------------------------------------------------------------------------------------
@@ -146,13 +156,8 @@ def _checked(kind: type, name: str, entry: object, where: str) -> object:
             return float(entry)
         elif isinstance(entry, origin) and not (origin is int and isinstance(entry, bool)):
             return entry
-    choices = [
-        f"{word!r}"
-        for wanted in kinds
-        if typing.get_origin(wanted) is typing.Literal
-        for word in typing.get_args(wanted)
-    ]
-    expected = " or ".join(choices or [getattr(wanted, "__name__", str(wanted)) for wanted in kinds])
+    choices = typing.get_args(hint) if typing.get_origin(hint) is typing.Literal else ()
+    expected = " or ".join(map(repr, choices) if choices else (getattr(kind, "__name__", str(kind)) for kind in kinds))
     raise BadSettings(f"{where}: {name} = {entry!r}: expected {expected}")
 
 

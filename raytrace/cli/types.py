@@ -1,23 +1,13 @@
-"""Types of the values of options: each reads a text, or raises ArgumentTypeError. Imports no torch."""
+"""Readers of the values of options: each reads a text, or raises ArgumentTypeError. Imports no torch."""
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path, PurePath
+from typing import TypeAlias
+
+Reader: TypeAlias = Callable[[str], object]
 
 PICTURES = (".png", ".pdf", ".svg")
-
-
-class Names:
-    """`choices` of an option from a table of the library, which is imported when the option is used."""
-
-    def __init__(self, table: Callable[[], Iterable[str]]):
-        self._table = table
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._table())
-
-    def __contains__(self, name: str) -> bool:
-        return name in tuple(self)
 
 
 # -- files
@@ -32,7 +22,7 @@ class InputFile(str):
 class OutputFile(str):
     """Name of a file that is written; suffixes: those allowed, any if empty."""
 
-    suffixes: Iterable[str] = ()
+    suffixes: tuple[str, ...] = ()
 
 
 class OutputFolder(str):
@@ -60,8 +50,8 @@ def data_file(text: str) -> OutputFile:
     return OutputFile(text)
 
 
-def file_of(suffixes: Iterable[str]) -> Callable[[str], OutputFile]:
-    """The type of a data file to write with one of these suffixes."""
+def file_of(*suffixes: str) -> Callable[[str], OutputFile]:
+    """The reader of a data file to write with one of these suffixes."""
 
     def reader(text: str) -> OutputFile:
         file = data_file(text)
@@ -69,6 +59,13 @@ def file_of(suffixes: Iterable[str]) -> Callable[[str], OutputFile]:
         return file
 
     return reader
+
+
+def lens_file(text: str) -> OutputFile:
+    """A lens file to write."""
+    from raytrace.io import WRITTEN  # loads torch
+
+    return file_of(*WRITTEN)(text)
 
 
 def picture_file(text: str) -> OutputFile:

@@ -2,8 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import group, json, output_folder, plot
-from raytrace.cli.options import option as option_of
+from raytrace.cli.options import Option, group, json, output_folder, plot
 from raytrace.cli.settings import SEED, add_options, defaults_of, listed, option, picture_options, settings_options
 from raytrace.cli.types import positive, positive_finite
 from raytrace.cli.wave_options import camera, feature, light, pixels
@@ -80,14 +79,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     group(
         "element and noise",
         feature("0.002 for rings"),
-        option_of(
-            "--focus",
-            metavar="MM",
-            type=positive,
-            default=1000.0,
-            help="object distance whose PSF the Wiener filter is made for (default 1000)",
-        ),
-        option_of("--noise", metavar="S", type=positive_finite, help=f"{NOISE} (default 0.01)"),
+        Option("focus", positive, "MM", "object distance whose PSF the Wiener filter is made for", default=1000.0),
+        Option("noise", positive_finite, "S", f"{NOISE} (default 0.01)"),
     )(parser)
     learning = ("loss", "restoration", "optimizer", "schedule", "rate", "steps", "starts")
     add_options(parser.add_argument_group("optimisation"), defaults, ROWS, *learning)

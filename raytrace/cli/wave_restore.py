@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import group, json, option, output_folder, row
+from raytrace.cli.options import Option, group, json, output_folder, row
 from raytrace.cli.types import file_name, positive, positive_finite
 from raytrace.cli.wave_design import NOISE
 from raytrace.cli.wave_options import camera, element, light, pixels
@@ -24,18 +24,16 @@ EXAMPLES = """examples:
 
 def options(parser: argparse.ArgumentParser) -> None:
     for add in (
-        option("images", metavar="IMAGE", type=file_name, nargs="+", help="captured images, or scenes"),
+        Option("images", file_name, "IMAGE", "captured images, or scenes", flag="images", nargs="+"),
         element,
         camera(),
         light(depths=(500.0, 2000 / 3, 1000.0, 2000.0, float("inf"))),
         pixels(size=255),
         group(
             "restoration",
-            option("--noise", metavar="S", type=positive_finite, default=0.01, help=f"{NOISE} (default 0.01)"),
-            option(
-                "--simulate", metavar="MM", type=positive, help="object distance of the scenes in IMAGE; inf allowed"
-            ),
-            row("seed", default=0, help="of the simulated noise"),
+            Option("noise", positive_finite, "S", NOISE, default=0.01),
+            Option("simulate", positive, "MM", "object distance of the scenes in IMAGE; inf allowed"),
+            row("seed", "of the simulated noise"),
         ),
         output_folder("folder of the restored images, as .png", required=True),
         json,

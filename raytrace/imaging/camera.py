@@ -4,7 +4,7 @@ A training step of lens and network, in colour, at random places of the sensor:
 
     lens = rt.read_lens("cooke_triplet")
     sensor = rt.Sensor(size=(24, 16), pixels=(4800, 3200), response="rgb", full_well=2e4, read_noise=3)
-    camera = rt.Camera(rt.Variables(lens, "curvature thickness"), rt.UNet(channels=3), sensor=sensor)
+    camera = rt.Camera(rt.Variables(lens, "curvature thickness"), rt.imaging.UNet(channels=3), sensor=sensor)
     optimizer = torch.optim.Adam(camera.rates(optics=1e-3, network=1e-3))
     index = torch.arange(2)                                  # (B,): global numbers of the samples
     points = sensor.patch_points(sensor.random_patches(index, size=32), 32)
@@ -20,13 +20,13 @@ A training step of lens and network, in colour, at random places of the sensor:
 Grey pictures, (B, H, W), of field points by their numbers, as in studies of a few points of a scene:
 
     grey = rt.Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1)
-    camera = rt.Camera(rt.Variables(lens, "sensor"), rt.RedNet(), sensor=grey, fields=[0, 14])
+    camera = rt.Camera(rt.Variables(lens, "sensor"), rt.imaging.RedNet(), sensor=grey, fields=[0, 14])
     restored = camera(torch.rand(2, 64, 64), [25e3, 30e3], field=[0, 1])              # (B, 1, 44, 44)
 
 A phase element at the stop, whose heights are learned with the lens, or an element without a lens:
 
-    camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.PhaseVariables(element), sensor=sensor)
-    camera = rt.Camera(rt.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
+    camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.imaging.PhaseVariables(element), sensor=sensor)
+    camera = rt.Camera(rt.imaging.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
 """
 
 import dataclasses

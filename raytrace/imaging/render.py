@@ -551,7 +551,7 @@ def _afford_kernels(nodes: tuple[int, int], count: int, weights: Tensor, size: i
     (m, n), channels = nodes, len(weights)
     (columns, rows), each = sensor.pixels, _COPIES * weights.element_size()
     what = f"kernels of {size} × {size} pixels at {m} × {n} places of the sensor need too much memory"
-    helps = "take a larger --tol or a smaller --sensor, or focus the lens (--size sets their window)"
+    helps = "take a larger {tol} or a smaller {sensor}, or focus the lens ({size} sets their window)"
     afford(each * channels * count * m * n * size * size, what, helps=helps)
     what = f"{columns} × {rows} pixels of {channels} channels need too much memory"
     afford(each * channels * columns * rows, what, helps="take a picture of fewer pixels")
@@ -826,7 +826,8 @@ def render(
         layers, a logistic function of so large a share of the difference of their reciprocal distances.
     background: a picture of the farthest layer without the objects in front of it, which a blurred silhouette shows;
         by default every layer continues behind nearer ones as its visible surroundings do.
-    elements: phase elements in contact at the stop of the lens, of `rt.elements` or `rt.element`.
+    elements: phase elements in contact at the stop of the lens, of `rt.wave_optics.phase_elements` or
+        `rt.wave_optics.phase_element`.
     model: of the PSF, see `rt.psf`; by default the first of "gaussian", "drt" and "wave" whose kernels differ from
         the next model's by less than `tol`; with elements "wave".
     tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice the error of a picture from 0 to 1.
@@ -872,7 +873,10 @@ def element_in_stop(
     """The stop of elements without a lens; arguments as for `render`. Raises ValueError for a missing one."""
     parts = in_contact(elements)
     if not parts:
-        raise ValueError("no element: expected one or several in contact, of rt.elements or rt.element")
+        raise ValueError(
+            "no element: expected one or several in contact, of rt.wave_optics.phase_elements or "
+            "rt.wave_optics.phase_element"
+        )
     if sensor is None or sensor_distance is None:
         raise ValueError("elements without a lens: give sensor=rt.Sensor(…) and sensor_distance=…, mm")
     if wavelengths is None:

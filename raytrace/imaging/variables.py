@@ -68,7 +68,7 @@ from raytrace.tracing.geometry import edge_thickness, gaps, rims
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
-from raytrace.words import RaytraceError
+from raytrace.words import RaytraceError, option
 
 # -- thickness limits --------------------------------------------------------------------------------------------------
 
@@ -327,7 +327,7 @@ class Variables(Owned):
         self._before = self._values()  # numbers whose rays arrive
         if beyond := self.beyond():
             raise BadVariables(
-                f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
+                f"hold {hold!r}: {beyond}; hold another focal length, or end {option('vary')} with another variable"
             )
 
     @torch.no_grad()
@@ -534,7 +534,7 @@ class Variables(Owned):
         columns = [(n.surface, GLASS[n.quantity]) if n.quantity in GLASS else None for n in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
-            raise BadVariables("no glass varies: name its numbers in `vary`, as index:1,3 abbe_number:1,3")
+            raise BadVariables(f"no glass varies: name its numbers in {option('vary')}, as index:1,3 abbe_number:1,3")
         lens = self.design.lens
         pool = pool_of(lens, catalogs_of(lens, self.catalog))
         start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
@@ -587,7 +587,9 @@ def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
     design = design_variables(dataclasses.replace(lens, optimization_data=unsolved), vary)
     for number in design.variables:
         if number.quantity == "glass" or (number.surface, number.quantity) == (0, "thickness"):
-            raise BadVariables(f"`vary={joined(vary)}`: {name_of(number)} is a variable of optimize and jacobian alone")
+            raise BadVariables(
+                f"{option('vary', joined(vary))}: {name_of(number)} is a variable of optimize and jacobian alone"
+            )
     return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
 

@@ -35,6 +35,7 @@ from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.poses import Pose, undone
 from raytrace.system.surface import SHAPE, Surface
+from raytrace.words import option
 
 #: More characters than the name of any glass has.
 _LONGEST = 80
@@ -79,7 +80,7 @@ def listed_glass(
             report.glass(place, name, f"{glass_words(glass)}, the nearest glass by nd and Vd")
             return glass
         lacks = "the file has no nd and Vd to find the nearest glass by; " if nearest or other else ""
-        hint = f"{lacks}specify a substitute by --substitute {name}=OTHER (`substitute`)"
+        hint = f"{lacks}specify a substitute by {option('substitute', f'{name}=OTHER')}"
         raise UnknownGlass(error.name, error.where, error.suggestions, error.searched, hint) from None
 
 

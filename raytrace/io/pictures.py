@@ -13,7 +13,7 @@ from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 from PIL.ImageFile import ImageFile
 
 from raytrace.files import read_bytes, write_atomically
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
@@ -224,7 +224,7 @@ def read_depth(path: str | Path, depth_range: tuple[float, float] | None = None)
     """
     if Path(path).suffix.lower() == ".npy":
         if depth_range is not None:
-            raise PictureError(f"{path}: an array of distances in mm needs no `depth_range`: leave it out")
+            raise PictureError(f"{path}: an array of distances in mm needs no {option('depth_range')}: leave it out")
         try:
             depth = np.load(io.BytesIO(read_bytes(path, _MOST_ARRAY)), allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
@@ -238,10 +238,12 @@ def read_depth(path: str | Path, depth_range: tuple[float, float] | None = None)
     levels = read_levels(path, 1)[0] if tiff else None
     if levels is not None and levels.dtype.kind == "f":
         if depth_range is not None:
-            raise PictureError(f"{path}: floating-point distances in mm need no `depth_range`: leave it out")
+            raise PictureError(f"{path}: floating-point distances in mm need no {option('depth_range')}: leave it out")
         return levels.astype(np.float64)
     if depth_range is None:
-        raise PictureError(f"{path}: a picture has levels and no distances; give `depth_range`, mm of black and white")
+        raise PictureError(
+            f"{path}: a picture has levels and no distances; give {option('depth_range')}, mm of black and white"
+        )
     near, far = depth_range
     if not 0 < near < far < np.inf:
         raise PictureError(f"{path}: a depth range of {near:g} to {far:g} mm; expected 0 < near < far, both finite")

@@ -32,7 +32,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import RAY_AIMING
 from raytrace.system.optimization_data import Row
 from raytrace.system.surface import Surface, is_freeform, is_posed
-from raytrace.words import RaytraceError, RaytraceWarning, named
+from raytrace.words import RaytraceError, RaytraceWarning, named, option
 
 #: Limits beyond which a file is no sequential lens; real lens files have a few hundred kB. They bound the reading time.
 MAX_BYTES = 16 * 2**20
@@ -460,7 +460,9 @@ def substitutes_of(requested: Mapping[str, str] | str | Sequence[str] | None) ->
         if other == "" and name in general:
             continue
         if not (isinstance(name, str) and isinstance(other, str) and name.strip() and other.strip()):
-            raise BadSubstitute(f"`substitute`: {name!r} for {other!r}; expected GLASS=OTHER, {NEAREST} or {FORMULA}")
+            raise BadSubstitute(
+                f"{option('substitute')}: {name!r} for {other!r}; expected GLASS=OTHER, {NEAREST} or {FORMULA}"
+            )
         by_name[name.strip().upper()] = other.strip()
     return Substitutes(by_name, NEAREST in general, FORMULA in general)
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from raytrace.materials.glass import FORMULAS, WITH_ERRORS, Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.words import RaytraceWarning
+from raytrace.words import RaytraceWarning, option
 
 #: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)
@@ -150,9 +150,9 @@ def objection(place: Environment) -> str:
     if not COLDEST < temperature <= HOTTEST:
         limit = f"above {COLDEST:g}" if temperature <= COLDEST else f"up to {HOTTEST:g}"
         fitted = "thermal coefficients of catalogs hold from {:g} to {:g}".format(*FITTED)
-        return f"`temperature={temperature:g}`: expected degrees Celsius {limit}; {fitted}"
+        return f"{option('temperature', f'{temperature:g}')}: expected degrees Celsius {limit}; {fitted}"
     if not 0 <= pressure < torch.inf:
-        return f"`pressure={pressure:g}`: expected atmospheres, 0 (vacuum) or more"
+        return f"{option('pressure', f'{pressure:g}')}: expected atmospheres, 0 (vacuum) or more"
     return ""
 
 

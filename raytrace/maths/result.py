@@ -16,6 +16,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.plotting import style
+from raytrace.words import option
 
 if TYPE_CHECKING:  # both are slow to load
     import pandas
@@ -128,13 +129,15 @@ class Result:
         elif suffix == ".csv":
             write_atomically(path, lambda file: self.to_frame().to_csv(file, index=False))
         else:
-            raise ValueError(f"{os.fspath(path)}: a result is saved as .csv or .json; figures are saved by `plot`")
+            raise ValueError(
+                f"{os.fspath(path)}: a result is saved as .csv or .json; figures are saved by {option('plot')}"
+            )
 
     def document(self) -> dict:
         """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}
 
-    def draw(self, **options: Any) -> "Figure":
+    def draw(self, *arguments: Any, **options: Any) -> "Figure":
         """The figure of `plot`. Raises TypeError: no figure."""
         raise TypeError(f"{type(self).__name__} has no figure")
 

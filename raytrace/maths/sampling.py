@@ -14,6 +14,7 @@ from torch import Tensor
 
 from raytrace.budget import afford
 from raytrace.maths.numerics import value
+from raytrace.words import option
 
 _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
 _POINT_BYTES = 64  # of a point and its weight, with the memory to compute them
@@ -23,12 +24,12 @@ def _at_least_one(rule: str, **sizes: float) -> None:
     """Raise ValueError for a rule without points."""
     for name, size in sizes.items():
         if not size >= 1:
-            raise ValueError(f"{rule}: `{name}` is {size}; expected 1 or more")
+            raise ValueError(f"{rule}: {option(name)} is {size}; expected 1 or more")
 
 
-def _afford(count: float, rule: str, option: str) -> None:
+def _afford(count: float, rule: str, size: str) -> None:
     """Raise OverBudget for a rule whose `count` points do not fit into memory."""
-    afford(_POINT_BYTES * count, f"{rule}: {count:.3g} points of the pupil", helps=f"ask for fewer `{option}`")
+    afford(_POINT_BYTES * count, f"{rule}: {count:.3g} points of the pupil", helps=f"ask for fewer {{{size}}}")
 
 
 def gauss_rings(
@@ -192,8 +193,8 @@ def sampled(
     given = {"rings": rings, "points": points}
     wrong = "points" if counted == "rings" else "rings"
     if given[wrong] is not None:
-        takers = ", ".join(name for name, (_, option, _) in SAMPLINGS.items() if option == wrong)
-        raise ValueError(f"`{wrong}` belongs to `sampling={takers}`; {sampling} takes `{counted}`")
+        takers = option("sampling", ", ".join(name for name, row in SAMPLINGS.items() if row[1] == wrong))
+        raise ValueError(f"{option(wrong)} belongs to {takers}; {sampling} takes {option(counted)}")
     seeds = {"seed": seed} if rule in (sobol, random) else {}
     return rule(size if given[counted] is None else given[counted], **seeds, dtype=dtype, device=device)
 

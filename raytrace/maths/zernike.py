@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from raytrace.words import option
+
 Order = tuple[int, int]
 
 #: By |m|, for k = 0, 1, … the polynomial P_k^(0, |m|)(t) and its derivatives.
@@ -140,7 +142,8 @@ def _solved(values: Tensor, root: Tensor, q: Tensor, r: Tensor) -> Tensor:
 def refuse_few(points: int, coefficients: int) -> None:
     if points < coefficients:
         raise ValueError(
-            f"{points} points of positive weight cannot fit {coefficients} coefficients; ask for fewer `terms`"
+            f"{points} points of positive weight cannot fit {coefficients} coefficients; ask for fewer "
+            f"{option('terms')}"
         )
 
 

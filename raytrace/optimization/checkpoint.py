@@ -11,6 +11,7 @@ import numpy as np
 from raytrace.maths.result import plain
 from raytrace.optimization.least_squares import PATHS, Cycle, CycleStart, PathProgress
 from raytrace.stores import (
+    Check,
     Document,
     Kind,
     Store,
@@ -63,7 +64,7 @@ class Stored(NamedTuple):
 
 _CHECKPOINT = Kind(
     BadCheckpoint,
-    "expected what `checkpoint` wrote; start anew without `resume`",
+    "expected a checkpoint of optimize; start anew without it",
     BadCheckpoint,
     "{path}: a checkpoint of {difference}; resume with the options that it was made with",
     unlike,
@@ -133,7 +134,7 @@ class Checkpoint:
 def read_checkpoint(path: str | PathLike, about: Mapping[str, object], names: Sequence[str]) -> Stored:
     """The checkpoint of this optimisation. Raises BadCheckpoint and OSError."""
     finite, entry = listed(number(), len(names), len(names)), either(exactly(None), number(infinite=True))
-    columns = (whole(), *(number(0),) * 4, whole(), number(), text)
+    columns: tuple[Check, ...] = (whole(), *(number(0),) * 4, whole(), number(), text)
     document_of = record(
         {"variables": mapped(number()), "cycles": whole()},
         {

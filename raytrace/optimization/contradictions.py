@@ -30,6 +30,7 @@ from raytrace.optimization.merit import arguments
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem, typical_of
 from raytrace.optimization.variables import name_of
+from raytrace.words import option
 
 _EXCLUDED = 1e-7  # total miss of the linear program, conditions by their slopes
 _COUNTS = 1e-6  # multipliers that count
@@ -50,7 +51,10 @@ def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray,
     texts = [_condition_text(problem, row) for row in conflict.rows]
     values = {condition.words: condition.reached for condition in conditions_attained(problem, problem.evaluated(x))}
     listed = ", ".join(f"{text} (now {values[text]:.6g})" if text in values else text for text in texts)
-    raise NoProblem(f"`hold`: {listed}: {conflict.words(problem)}; change `hold`, `vary` or `bounds`")
+    raise NoProblem(
+        f"{option('hold')}: {listed}: {conflict.words(problem)}; change {option('hold')}, {option('vary')} or "
+        f"{option('bounds')}"
+    )
 
 
 def with_reasons(

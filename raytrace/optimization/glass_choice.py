@@ -37,6 +37,7 @@ from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import GLASS
+from raytrace.words import option
 
 _MATTERS = 1e-6  # smallest change of the index at the wavelengths by a number of a glass that varies
 
@@ -56,7 +57,9 @@ class Pool:
         self.glasses = tuple(glass for glass, use in zip(self.glasses, usable, strict=True) if use)
         self.numbers = numbers[usable]
         if not len(self.numbers):
-            raise NoProblem("no glass of the catalogs covers the wavelengths of the lens; name others by `catalog`")
+            raise NoProblem(
+                f"no glass of the catalogs covers the wavelengths of the lens; name others by {option('catalog')}"
+            )
         self.normal, self.reach = hull(self.numbers)
 
     @property
@@ -125,7 +128,7 @@ def catalogs_of(lens: Lens, catalog: Sequence[str | PathLike] = ()) -> tuple[Cat
         try:
             catalogs.append(shipped_catalog(str(name)))
         except CatalogError as error:
-            raise NoProblem(f"`catalog`: {error}") from None
+            raise NoProblem(f"{option('catalog')}: {error}") from None
     return tuple(catalogs)
 
 

@@ -50,7 +50,7 @@ from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens, is_round_about_axis
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
-from raytrace.words import RaytraceError, did_you_mean
+from raytrace.words import RaytraceError, did_you_mean, option
 
 # -- default merit functions -------------------------------------------------------------------------------------------
 
@@ -135,17 +135,23 @@ class DefaultMerit:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise BadMerit(f"`merit={self.kind}`: expected one of {', '.join(KINDS)}{did_you_mean(self.kind, KINDS)}")
+            raise BadMerit(
+                f"{option('merit', self.kind)}: expected one of {', '.join(KINDS)}{did_you_mean(self.kind, KINDS)}"
+            )
         if self.reference not in REFERENCES:
-            raise BadMerit(f"`reference={self.reference}`: expected one of {', '.join(REFERENCES)}")
+            raise BadMerit(f"{option('reference', self.reference)}: expected one of {', '.join(REFERENCES)}")
         whole = isinstance(self.rings, Integral) and isinstance(self.arms, Integral)
         if not whole or self.rings < 1 or self.arms < 2 or self.arms % 2:
-            raise BadMerit(f"`rings={self.rings}` and `arms={self.arms}`: expected 1 or more, and an even number")
+            raise BadMerit(
+                f"{option('rings', self.rings)} and {option('arms', self.arms)}: expected 1 or more, and an even number"
+            )
         object.__setattr__(self, "frequencies", tuple(np.atleast_1d(self.frequencies).astype(float).tolist()))
         if not all(0 <= frequency < np.inf for frequency in self.frequencies):
-            raise BadMerit(f"`frequencies={self.frequencies}`: expected finite numbers, 0 or more, cycles/mm")
+            raise BadMerit(f"{option('frequencies', self.frequencies)}: expected finite numbers, 0 or more, cycles/mm")
         if bool(self.frequencies) != (self.kind == "mtf"):
-            raise BadMerit("`merit=mtf` goes with `frequencies`, cycles/mm, and no other merit does")
+            raise BadMerit(
+                f"{option('merit', 'mtf')} goes with {option('frequencies')}, cycles/mm, and no other merit does"
+            )
         object.__setattr__(self, "conventions", conventions_of(self.conventions))
 
     @property
@@ -188,7 +194,7 @@ def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
         _weights(lens.wavelength_weights, settings.wavelength_weights, "wavelength"),
     )
     count = sum(_arm_count(lens, field, settings.arms) for field, _ in fields) * len(colours) * settings.rings
-    _refuse_many(count, f"`rings={settings.rings}` and `arms={settings.arms}`")
+    _refuse_many(count, f"{option('rings', settings.rings)} and {option('arms', settings.arms)}")
     nodes, weights = gauss_legendre(settings.rings)
     for field, field_weight in fields:
         angles = _arms(lens, field, settings.arms)
@@ -203,7 +209,7 @@ def _by_rays(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
 def _by_frequencies(lens: Lens, operand: str, settings: DefaultMerit) -> Iterator[Row]:
     """A row for every field and frequency, all wavelengths together, with a target of 1."""
     fields = _fields(lens, settings)
-    _refuse_many(len(fields) * len(settings.frequencies), f"{len(settings.frequencies)} `frequencies`")
+    _refuse_many(len(fields) * len(settings.frequencies), f"{len(settings.frequencies)} {option('frequencies')}")
     for number, (_, weight) in enumerate(fields, 1):
         for frequency in settings.frequencies if weight else ():
             share = weight / (len(fields) * len(settings.frequencies))
@@ -225,9 +231,9 @@ def _weights(of_lens: Tensor, weights: Sequence[float] | None, kind: str) -> lis
         return of_lens.detach().tolist()
     numbers = np.atleast_1d(weights).astype(float)
     if len(numbers) != len(of_lens):
-        raise BadMerit(f"`{kind}_weights`: {len(numbers)} weights, and the lens has {len(of_lens)} {kind}s")
+        raise BadMerit(f"{option(f'{kind}_weights')}: {len(numbers)} weights, and the lens has {len(of_lens)} {kind}s")
     if not (numbers.min() >= 0 and numbers.sum() > 0):
-        raise BadMerit(f"`{kind}_weights`: expected 0 or more, not all of them 0")
+        raise BadMerit(f"{option(f'{kind}_weights')}: expected 0 or more, not all of them 0")
     return numbers.tolist()
 
 
@@ -305,7 +311,7 @@ class Merit:
         Raises BadMerit if the file has none.
         """
         if lens.optimization_data is None or not lens.optimization_data.merit:
-            raise BadMerit("the lens has no merit function of its own: choose one by `merit=spot`")
+            raise BadMerit(f"the lens has no merit function of its own: choose one by {option('merit', 'spot')}")
         boundaries = Boundaries.of(glass_thickness, air_thickness, edge)
         stored = cls(
             lens.optimization_data.merit, lens.optimization_data.unit, conventions=conventions,
@@ -415,7 +421,9 @@ def merit_of_options(
     if merit is not None:
         return DefaultMerit(merit, **settings)
     if other := {*settings} - {"glass_thickness", "air_thickness", "edge", "conventions"}:
-        raise BadMerit(f"`{min(other)}` belongs to a default merit function: name it by `merit`, as spot")
+        raise BadMerit(
+            f"{option(min(other))} belongs to a default merit function: name it by {option('merit')}, as spot"
+        )
     return Merit.of(lens, skip_unknown=skip_unknown, **settings)
 
 
@@ -584,7 +592,8 @@ class Evaluation:
         def skip(line: Line, why: str, meant: str = "") -> None:
             if line.row.weight != 0 and not skip_unknown:
                 raise UnknownOperand(
-                    f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out{meant}"
+                    f"row {line.number} of the merit function: {why}; {option('skip_unknown')} leaves such rows "
+                    f"out{meant}"
                 )
             skipped.add(line.number)
 

@@ -40,7 +40,7 @@ from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.words import calling_level
+from raytrace.words import calling_level, option
 
 _LOG = logging.getLogger(__name__)
 
@@ -93,18 +93,18 @@ def optimize(
     for path, suffixes in ((log, LOGS), (checkpoint, CHECKPOINTS)):
         if path is not None:
             check_output(path, suffixes)
-    for option, path in (("checkpoint", checkpoint), ("resume", resume)):
+    for name, path in (("checkpoint", checkpoint), ("resume", resume)):
         if log is not None and path is not None and os.path.realpath(log) == os.path.realpath(path):
-            raise ValueError(f"{log}: `log` and `{option}` are one file; give them two")
+            raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
     model, glasses = without_glass(design_variables(lens, vary), vary)
     names = tuple(map(name_of, model.variables))
     if not names:
-        raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
+        raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
     lower, upper = bounds_of(model.lens, model.variables, bounds)
     for name, least, most in zip(names, lower, upper, strict=True):
         if not least <= most:
-            raise NoProblem(f"`bounds` of {name}: from {least:g} to {most:g} there is nothing")
+            raise NoProblem(f"{option('bounds')} of {name}: from {least:g} to {most:g} there is nothing")
     typical = typical_of(model)
     is_stored = checkpoint is not None or resume is not None
 
@@ -127,11 +127,15 @@ def optimize(
     dependencies: dict[str, object] = {}
     if callable(merit):
         if glasses:
-            raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
+            raise NoProblem(f"{option('vary', 'glass')} goes with a merit of rows: make the function a row")
         if hold:
-            raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
+            raise NoProblem(
+                f"{option('hold')} goes with a merit of rows: of a function give {option('bounds')}, or make it a row"
+            )
         if as_built is not None:
-            raise NoProblem("`as_built` goes with a merit of rows: add `as_built.of(lens).expected` to the function")
+            raise NoProblem(
+                f"{option('as_built')} goes with a merit of rows: add `as_built.of(lens).expected` to the function"
+            )
         if is_stored:
             dependencies = about(merit=getattr(merit, "__qualname__", type(merit).__name__))
         function = FunctionMerit(model, merit, stored(dependencies).evaluated)

@@ -22,6 +22,7 @@ from raytrace.optimization.problem import Expectation
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
+from raytrace.words import option
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -195,7 +196,7 @@ class Optimized(Result):
         low = int((self.values_before[rows].abs() < _UNSHARP).sum())
         if 2 * low <= len(rows):
             return []
-        hint = "minimise `merit=spot` first, then the MTF from its result"
+        hint = f"minimise {option('merit', 'spot')} first, then the MTF from its result"
         return [f"  {low} of {len(rows)} rows of the MTF start below {_UNSHARP:g}, where it hardly has a slope: {hint}"]
 
     def _lengths(self) -> Table:

@@ -1,6 +1,6 @@
 """Figure of an optimisation: one page with the lens, its spots and its merit function before and after."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from raytrace.system.lens import Lens, field_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.figure import Figure
 
 _MOST_FIELDS = 5
 _MOST_BARS = 10
@@ -35,7 +35,8 @@ def optimize_report(result: Optimized) -> "Figure":
     figure = style.new_figure(10.0, 0.3 + sum(heights))
     name = style.fill(result.lens.name, figure.get_figwidth(), 12, bold=True) or "Lens"
     figure.suptitle(name, fontsize=12, fontweight="bold")
-    top, middle, bottom, *last = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0.02)
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0.02)
+    top, middle, bottom, *last = parts
     for row, (label, before, after) in zip(top.subplots(count, 2, squeeze=False), drawn, strict=True):
         for axes, lens, when, merit in (
             (row[0], before, "Before", result.merit_before),
@@ -93,12 +94,12 @@ def drawn_fields(lens: Lens) -> Tensor:
     return points[:, chosen.tolist()]
 
 
-def _draw_spots(page: "SubFigure", drawn: list[tuple[str, Lens, Lens]]) -> None:
+def _draw_spots(page: Any, drawn: list[tuple[str, Lens, Lens]]) -> None:
     """A row of spots before and one after, of every configuration, on one scale; small ones are enlarged in a corner
     of their panel."""
     panels = page.subplots(2 * len(drawn), max(drawn_fields(after).shape[1] for _, _, after in drawn), squeeze=False)
     first = drawn[0][2]
-    wavelengths, airy = style.array(first.wavelengths), float(airy_radius(first))
+    wavelengths, airy = first.wavelengths.tolist(), float(airy_radius(first))
     rows = []
     for label, *both in drawn:
         spots = [field_spots(lens, fields=drawn_fields(lens)) for lens in both]
@@ -106,7 +107,7 @@ def _draw_spots(page: "SubFigure", drawn: list[tuple[str, Lens, Lens]]) -> None:
         rows += [(label, *row, half) for row in zip(both, spots, ("before", "after"), strict=True)]
     for row, (label, lens, (whole, dots), when, half) in zip(panels, rows, strict=True):
         fields = drawn_fields(lens)
-        waves, radius = style.array(lens.wavelengths), float(airy_radius(lens))
+        waves, radius = lens.wavelengths.tolist(), float(airy_radius(lens))
         for f, panel in enumerate(row):
             if f >= fields.shape[1]:
                 panel.axis("off")

@@ -47,7 +47,7 @@ from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 from raytrace.tracing.paraxial import largest_field
-from raytrace.words import RaytraceError, did_you_mean
+from raytrace.words import RaytraceError, did_you_mean, option
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ def conditions_in_unit(lens: Lens, hold: str | Sequence[str | Condition] | None,
 def _condition(lens: Lens, word: str) -> Condition:
     name, configuration, relation, number = split_constraint(word)
     if configuration > len(lens.configurations):
-        raise BadHold(f"`hold`: {word!r}: configuration {configuration}; this lens has {len(lens.configurations)}")
+        raise BadHold(
+            f"{option('hold')}: {word!r}: configuration {configuration}; this lens has {len(lens.configurations)}"
+        )
     view = lens.configuration(configuration) if configuration else lens
     if name in WORDS:
         known = WORDS[name]
@@ -104,25 +106,29 @@ def _condition(lens: Lens, word: str) -> Condition:
     elif sum_of := re.fullmatch(r"thickness:(\d+)(?:-(\d+))?", name):
         first, last = int(sum_of[1]), int(sum_of[2] or sum_of[1])
         if not 0 <= first <= last <= sensor(lens):
-            raise BadHold(f"`hold`: {word!r}: this lens has gaps behind surfaces 0 to {sensor(lens)}")
+            raise BadHold(f"{option('hold')}: {word!r}: this lens has gaps behind surfaces 0 to {sensor(lens)}")
         known, arguments = Word("TTHI", "a sum of thicknesses"), ((first, last), _NONE[1])
     elif operand := re.fullmatch(r"([A-Z][A-Z0-9]{3})(?:\(([^()]*)\))?", name):
         if operand[1] not in OPERANDS:
-            raise BadHold(f"`hold`: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], map(str, OPERANDS))}")
+            raise BadHold(
+                f"{option('hold')}: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], map(str, OPERANDS))}"
+            )
         known, arguments = Word(operand[1], "", ""), _arguments(operand[2] or "", word)
     else:
         meant = f"; did you mean {_INSTEAD[name.lower()]}?" if name.lower() in _INSTEAD else did_you_mean(name, WORDS)
-        raise BadHold(f"`hold`: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}")
+        raise BadHold(
+            f"{option('hold')}: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}"
+        )
     bounds = OPERANDS[known.operand].bounds
     if bounds and relation != bounds:
-        raise BadHold(f"`hold`: {word!r}: {name} is a limit on one side; expected {name}{bounds}{number}")
+        raise BadHold(f"{option('hold')}: {word!r}: {name} is a limit on one side; expected {name}{bounds}{number}")
     try:
         target = float(number.removesuffix(known.unit) if known.unit else number)
     except ValueError:
         target = float("nan")
     if not abs(target) < float("inf"):
         unit = f" in {known.unit}" if known.unit else ""
-        raise BadHold(f"`hold`: {word!r}: {number!r} is no number{unit}")
+        raise BadHold(f"{option('hold')}: {word!r}: {number!r} is no number{unit}")
     return Condition(Row(known.operand, *arguments, target=target), relation, configuration, name)
 
 
@@ -134,7 +140,9 @@ def _arguments(text: str, word: str) -> Arguments:
     except ValueError:
         numbers, first = [0.0] * 7, []
     if len(numbers) > 6 or first != numbers[:2]:
-        raise BadHold(f"`hold`: {word!r}: expected two whole numbers and up to four numbers, as REAY(8,0,0,1,0,0)")
+        raise BadHold(
+            f"{option('hold')}: {word!r}: expected two whole numbers and up to four numbers, as REAY(8,0,0,1,0,0)"
+        )
     first, others = first + [0] * (2 - len(first)), numbers[2:] + [0.0] * (4 - len(numbers[2:]))
     return (first[0], first[1]), (others[0], others[1], others[2], others[3])
 
@@ -151,7 +159,7 @@ def _behind_the_lens(lens: Lens) -> Arguments:
 def _chief_ray(lens: Lens) -> Arguments:
     """The ray of the largest field through the centre of its pupil, vignetting applied, on the image."""
     if not (extent := lens.fields.extent):
-        raise BadHold("`hold`: all fields are on the axis: there is no off-axis chief ray")
+        raise BadHold(f"{option('hold')}: all fields are on the axis: there is no off-axis chief ray")
     x, y = (largest_field(lens)[:, 0] / extent).tolist()
     return (len(lens.surfaces) - 1, 0), (x, y, 0.0, 0.0)
 
@@ -376,9 +384,11 @@ class Problem:
         self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), **self._settings)
         weights = self.evaluation.weights
         if not len(model.variables):
-            raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
+            raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
         if not (weights > 0).any():
-            raise NoProblem("no row of the merit function has a weight that counts: choose another by `merit`")
+            raise NoProblem(
+                f"no row of the merit function has a weight that counts: choose another by {option('merit')}"
+            )
         signs = [0] * len(self.rows) + [sign for _, sign in held]
         self.signs = np.where(weights < 0, signs, 0)
         self.recovery = Recovery(self.evaluation)

@@ -44,6 +44,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
+from raytrace.words import option
 
 _SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 _NEAR = 0.01  # relative change of the residuals by a step along a variable, for second derivatives
@@ -57,15 +58,15 @@ def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[in
     """All surfaces before which a meniscus can be inserted, or the given ones, checked. Raises NoProblem."""
     lens = free.lens
     if lens.operands:
-        raise NoProblem("`insert`: the lens has several configurations; take one of them")
+        raise NoProblem(f"{option('insert')}: the lens has several configurations; take one of them")
     if not surfaces:
         surfaces = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
         if not surfaces:
-            raise NoProblem("`insert`: no spherical surface between glass and air whose curvature varies")
+            raise NoProblem(f"{option('insert')}: no spherical surface between glass and air whose curvature varies")
         return surfaces
     for k in surfaces:
         if objection := _objection(free, k):
-            raise NoProblem(f"`insert`: surface {k} {objection}")
+            raise NoProblem(f"{option('insert')}: surface {k} {objection}")
     return tuple(dict.fromkeys(surfaces))
 
 
@@ -81,7 +82,7 @@ def _objection(free: DesignVariables, k: int) -> str:
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
         return "is not between glass and air"
     varies = any(variable.address == (k, "curvature") for variable in free.variables)
-    return "" if varies else "has a curvature that does not vary: name it by `vary`"
+    return "" if varies else f"has a curvature that does not vary: name it by {option('vary')}"
 
 
 # -- the lens with one element more ------------------------------------------------------------------------------------
@@ -319,7 +320,10 @@ class Insertion:
         until = self.journal.until
         of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
         if not of_lens.is_valid:
-            raise NoProblem("`insert`: the lens itself loses rays or violates `hold`; search without insert first")
+            raise NoProblem(
+                f"{option('insert')}: the lens itself loses rays or violates {option('hold')}; search without insert "
+                "first"
+            )
         lens, work = model.lens_at(of_lens.x), of_lens.seconds
         bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
         try:

@@ -63,7 +63,7 @@ from raytrace.system.optimization_data import Row
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import calling_level
+from raytrace.words import calling_level, option
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -174,7 +174,7 @@ class Searched(Result):
                 _draw(axes, self, k)
             else:
                 axes.set_axis_off()
-        on_one_scale(panels[:count])
+        on_one_scale([*panels[:count]])
         return figure
 
     def save(self, folder: str | PathLike) -> None:
@@ -245,7 +245,7 @@ def searched(
 
 def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None) -> NoProblem:
     """The error of a search without minima, with the nearest lens of all its descents, which is written."""
-    parts = [f"no lens without failing rays that meets `hold`, from {starts} starts"]
+    parts = [f"no lens without failing rays that meets {option('hold')}, from {starts} starts"]
     ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
     if ends:
         nearest = min(ends, key=lambda end: end.rank)
@@ -259,7 +259,10 @@ def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: 
             write_lens(_design(task.whole, nearest.x, task.model.lens.name), path)
             place = f", in {path}"
         parts.append(f"the nearest of {len(ends)} descents{place}: {words or 'it is not at its minimum yet'}")
-    return NoProblem("; ".join(parts) + ": allow more `starts`, `seconds` or wider `bounds`, or hold less")
+    return NoProblem(
+        "; ".join(parts)
+        + f": allow more {option('starts')}, {option('seconds')} or wider {option('bounds')}, or hold less"
+    )
 
 
 def _design(problem: Problem, x: np.ndarray, name: str) -> Lens:
@@ -372,7 +375,8 @@ def search(
     free = design_variables(lens, vary)
     if any(variable.quantity == "glass" for variable in free.variables):
         raise NoProblem(
-            "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
+            f"{option('vary', 'glass')} is for optimize: search with the glasses as they are, then optimize what is "
+            "found"
         )
     glass, air = function.boundaries.glass, function.boundaries.air
     ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
@@ -382,7 +386,8 @@ def search(
     if insert is not None and insert is not False:
         if starts is not None:
             raise NoProblem(
-                "`starts` goes without `insert`, which begins at the lens alone, on both sides of every surface"
+                f"{option('starts')} goes without {option('insert')}, which begins at the lens alone, on both sides "
+                "of every surface"
             )
         surfaces = surfaces_of(free, () if insert is True else tuple(insert))
     if conditions:

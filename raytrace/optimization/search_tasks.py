@@ -32,7 +32,7 @@ from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, 
 from raytrace.system.identity import identity, unlike
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import sensor
-from raytrace.words import RaytraceError, calling_level
+from raytrace.words import RaytraceError, calling_level, option
 
 # -- the journal -------------------------------------------------------------------------------------------------------
 
@@ -74,7 +74,7 @@ _JOURNAL = Kind(
     BadSearch,
     "it keeps no search: name a new folder",
     BadSearch,
-    "`folder`: {path} keeps a search of {difference}; name a new folder",
+    "{path} keeps a search of {difference}; name a new folder",
     unlike,
     "the search continues, but cannot resume from here",
 )
@@ -292,7 +292,8 @@ def space_of(
     for variable, least, most in zip(model.variables, lower, upper, strict=True):
         if not least <= most:
             raise NoProblem(
-                f"`bounds` of {variable.quantity}_{variable.surface}: from {least:g} to {most:g} there is nothing"
+                f"{option('bounds')} of {variable.quantity}_{variable.surface}: from {least:g} to {most:g} there is "
+                "nothing"
             )
     low, high = lower.copy(), upper.copy()
     for k, variable in enumerate(model.variables):
@@ -313,7 +314,7 @@ def _ends(
     if variable.quantity not in ("curvature", "thickness") or variable.surface == 0:
         return -np.inf, np.inf
     if length is None:
-        raise NoProblem("how large the lens is to be is not known: `hold` its focal length, as efl=50")
+        raise NoProblem(f"how large the lens is to be is not known: {option('hold')} its focal length, as efl=50")
     if variable.quantity == "curvature":
         aperture = model.lens.aperture
         if aperture.kind == "entrance_pupil_diameter":

@@ -51,7 +51,7 @@ from raytrace.system.parameter_paths import (
     sensor,
 )
 from raytrace.system.surface import medium_surfaces
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_you_mean
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_you_mean, option
 
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
@@ -92,7 +92,7 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
     of_file = () if data is None else data.solves
     if vary is None:
         if data is None or not data.variables:
-            raise BadVariables("the file has no variables: `vary` names them, as 'curvature thickness'")
+            raise BadVariables(f"the file has no variables: {option('vary')} names them, as 'curvature thickness'")
         return DesignVariables(lens, data.variables, of_file)
     listed = [vary] if isinstance(vary, str) else vary
     variables: dict[str, Vary] = {name_of(variable): variable for variable in listed if not isinstance(variable, str)}
@@ -108,7 +108,8 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
             }
     if not variables:
         raise BadVariables(
-            f"`vary={joined(words)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
+            f"{option('vary', joined(words))} leaves nothing to vary; expected words like curvature thickness:5,6 "
+            "conic:3"
         )
     free, solved = _addresses(variables.values()), _addresses(new)
     for surface, quantity, *_ in free & solved:
@@ -224,7 +225,7 @@ def bounds_of(
         chosen = [position for position, known in enumerate(names) if wanted & known]
         if not chosen:
             meant = did_you_mean(name, [known_name for known in names for known_name in known])
-            raise BadVariables(f"`bounds` for {name}, not among the variables{meant}")
+            raise BadVariables(f"{option('bounds')} for {name}, not among the variables{meant}")
         low[chosen], high[chosen] = ends
     return low, high
 
@@ -335,11 +336,13 @@ def without_glass(free: DesignVariables, vary: str | Sequence | None) -> tuple[D
     differing = [k for k in sorted(chosen) if any(path[:3] == ("surfaces", k, "glass") for path in paths)]
     if differing or not chosen:
         which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
-        raise BadVariables(f"`vary=glass`: the glass {which}")
+        raise BadVariables(f"{option('vary', 'glass')}: the glass {which}")
     of_file = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
     others = _others(free.variables, chosen) or _others(of_file, chosen)
     if not others:
-        raise BadVariables("`vary=glass`: nothing but glasses varies; name what follows them, as 'curvature glass'")
+        raise BadVariables(
+            f"{option('vary', 'glass')}: nothing but glasses varies; name what follows them, as 'curvature glass'"
+        )
     return dataclasses.replace(free, variables=others), tuple(sorted(chosen))
 
 
@@ -440,5 +443,5 @@ def split_constraint(word: str) -> tuple[str, int, str, str]:
     """Name, configuration (0: the current one), relation (=, <= or >=) and number of "efl@2=100". Raises BadHold."""
     parts = re.fullmatch(r"([^<>=≤≥@]+?)(?:@(\d+))?(<=|>=|==|[<>=≤≥])(.+)", word)
     if not parts:
-        raise BadHold(f"`hold`: {word!r}: expected a name, = or <= or >=, and a number, as efl=50")
+        raise BadHold(f"{option('hold')}: {word!r}: expected a name, = or <= or >=, and a number, as efl=50")
     return parts[1], int(parts[2] or 0), _RELATIONS[parts[3]], parts[4]

@@ -269,7 +269,7 @@ def _bessel_slope(x: Tensor, number: int) -> Tensor:
     return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
 
 
-_HELPS = "give a larger `tol`, a smaller `size` or `pixel`, a slower aperture (`f_number`), `model=drt`"
+_HELPS = "give a larger {tol}, a smaller {size} or {pixel}, a slower aperture ({f_number}), {model=drt}"
 
 
 def _speed(scene: Scene) -> str:

@@ -350,7 +350,7 @@ def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float
     """Raise OverBudget if (D, F, W) kernels of across × along pupil cells, `each` bytes, exceed the memory budget."""
     count = math.prod(kernels)
     need = f"the ray-traced PSF needs {across:,} × {along:,} pupil cells for each of {count} kernels"
-    helps = "give a larger `pixel`, fewer fields or wavelengths at once, `rays`, `model=gaussian`"
+    helps = "give a larger {pixel}, fewer fields or wavelengths at once, {rays}, {model=gaussian}"
     afford(each * count * across * along, f"{need}: the blur spans many pixels", helps=helps)
 
 

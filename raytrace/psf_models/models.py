@@ -47,7 +47,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, option
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 _PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
@@ -235,7 +235,7 @@ def psf(
     execution = execution or Execution()
     center = center or ("chief" if fields is None or grid is None else "axis")
     name = model if isinstance(model, str) else name_of(model)
-    for option, (word, words) in {
+    for parameter, (word, words) in {
         "model": (name, ("auto", *MODELS)),
         "center": (center, ("axis", "chief", "centroid")),
         "window": (window, ("follows", "fixed")),
@@ -243,7 +243,7 @@ def psf(
         "empty": (execution.empty, ("nan", "error")),
     }.items():
         if word not in words:
-            raise ValueError(f"{option} {word!r} is not known; expected {', '.join(words)}")
+            raise ValueError(f"{parameter} {word!r} is not known; expected {', '.join(words)}")
     parameters: Parameters | None = None  # of "auto"
     if name != "auto":
         parameters = MODELS[name].parameters() if isinstance(model, str) else model
@@ -287,13 +287,12 @@ def psf(
     weights = torch.ones_like(wavelengths) if weights is None else row(weights)
     if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
         raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
-    for option, values in (("object_distances", distances), ("wavelengths", wavelengths)):
+    for parameter, values in (("object_distances", distances), ("wavelengths", wavelengths)):
         if values.dim() != 1 or not len(values):
-            raise ValueError(f"{option} of shape {tuple(values.shape)}; expected one axis")
+            raise ValueError(f"{parameter} of shape {tuple(values.shape)}; expected one axis")
         if bool(values.isnan().any()) or bool((values == 0).any()):
-            raise ValueError(
-                f"{option} {values.tolist()}; expected numbers other than 0 and nan; give others by `{option}`"
-            )
+            others = f"expected numbers other than 0 and nan; give others by {option(parameter)}"
+            raise ValueError(f"{parameter} {values.tolist()}; {others}")
     if weights.shape != wavelengths.shape:
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
@@ -303,7 +302,7 @@ def psf(
     afford(
         _PIXEL_BYTES * D * F * W * rows * columns,
         f"{D * F * W:,} PSFs of {rows:,} × {columns:,} pixels",
-        helps="ask for a smaller `size`, or fewer `fields` at once",
+        helps="ask for a smaller {size}, or fewer {fields} at once",
     )
     if order is None and execution.memo is None:
         warn_of_filling(with_object_distance(lens, distances.min()), fields)

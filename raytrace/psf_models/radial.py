@@ -66,7 +66,7 @@ def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndar
     afford(
         8.0 * (8 * distinct * nodes**2 + (2 * distinct + 2 * count) * count),
         f"the PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
-        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
+        helps="ask for a smaller {size} or {pixel}, a slower aperture ({f_number}) or {model=drt}",
     )
     return _wave_rule(grid.rows, grid.columns, nodes, count)
 
@@ -144,7 +144,7 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     forewarn(
         5e-9 * count * len(places) * nodes**2,
         f"a PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
-        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
+        helps="ask for a smaller {size} or {pixel}, a slower aperture ({f_number}) or {model=drt}",
     )
     x, y = (places[:, axis, None] + node for axis in (0, 1))
     # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.
@@ -171,7 +171,7 @@ def _ring_table(rows: int, columns: int) -> np.ndarray:
     count = math.ceil(0.5 * math.hypot(rows, columns) * _STEPS) + 1
     places = _distinct(rows, columns)[0]
     what = f"the PSF of {rows} × {columns} pixels needs its light at {count:,} radii"
-    afford(10.0 * (count + 1) * len(places), what, helps="ask for a smaller `size`, or larger pixels")
+    afford(10.0 * (count + 1) * len(places), what, helps="ask for a smaller {size}, or larger pixels")
     (a0, b0), (a1, b1) = ((places + side).T[..., None, None] for side in (-0.5, 0.5))
     # A pixel has shares of rings between its nearest and its farthest corner only, less than 3/2 pixels apart.
     nearest = np.hypot(*np.maximum(0.0, places - 0.5).T)

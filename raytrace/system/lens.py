@@ -31,7 +31,7 @@ from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
-from raytrace.words import both_spellings, calling_level, did_you_mean
+from raytrace.words import both_spellings, calling_level, did_you_mean, option
 
 #: Units of a field point by the kind of field.
 FIELD_UNITS = dict(angle="degrees", object_height="mm", paraxial_image_height="mm", real_image_height="mm")
@@ -567,7 +567,7 @@ def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tens
         for angle in angles:
             if abs(angle) >= 90:
                 message = "a field angle is below 90 degrees, for rays start from the plane of the entrance pupil"
-                raise ValueError(f"`fields={angle:g}`: {message}")
+                raise ValueError(f"{option('fields', f'{angle:g}')}: {message}")
         return points
     if isinstance(fields, Tensor):
         return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
@@ -610,9 +610,13 @@ def _weights(kind: str, weights: Tensor | Sequence[float], *, like: Tensor) -> T
     """Weights of the wavelengths or fields `like`, one for each. Raises ValueError."""
     shares = _like(weights, like)
     if shares.shape != like.shape:
-        raise ValueError(f"`{kind}_weights`: {shares.numel()} found; expected {len(like)}, one for each {kind}")
+        raise ValueError(
+            f"{option(f'{kind}_weights')}: {shares.numel()} found; expected {len(like)}, one for each {kind}"
+        )
     if not bool((torch.isfinite(shares) & (shares >= 0)).all() and (shares > 0).any()):
-        raise ValueError(f"`{kind}_weights` {shares.tolist()}: expected numbers from 0 up, at least one above 0")
+        raise ValueError(
+            f"{option(f'{kind}_weights')} {shares.tolist()}: expected numbers from 0 up, at least one above 0"
+        )
     return shares
 
 
@@ -815,7 +819,7 @@ def check(lens: Lens) -> None:
     if bool(torch.isnan(lens.surfaces[0].thickness).any()):
         raise ValueError("the object distance is nan; expected mm, or inf")
     if not bool((torch.isfinite(lens.fields.x) & torch.isfinite(lens.fields.y)).all()):
-        raise ValueError("`fields` hold a number that is not finite; expected numbers y, or pairs (x, y)")
+        raise ValueError(f"{option('fields')} hold a number that is not finite; expected numbers y, or pairs (x, y)")
     at_infinity = bool(torch.isinf(lens.surfaces[0].thickness).any())
     if at_infinity and lens.fields.kind == "object_height":
         raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")

@@ -30,6 +30,7 @@ from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
 from raytrace.tolerancing.table import BadTolerance, ToleranceTable, groups_of
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
+from raytrace.words import option
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -203,7 +204,9 @@ class ToleranceAnalysis(Result):
     def _arrived(self) -> Tensor:
         """The trials. Raises ValueError where light arrives in none."""
         if not bool(self.trials.isfinite().any()):
-            reason = "no light arrives in any trial" if len(self.trials) else "no trials; give `trials` above 0"
+            reason = (
+                "no light arrives in any trial" if len(self.trials) else f"no trials; give {option('trials')} above 0"
+            )
             raise ValueError(f"no typical trial and no worst one: {reason}")
         return self.trials
 
@@ -443,10 +446,10 @@ def tolerance_analysis(
     if tolerances is None:
         tolerances = tolerance_table(lens, limits, grade=grade)
     elif grade or limits:
-        raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
+        raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if not len(tolerances):
-        raise BadTolerance("no tolerances; give rows, a `grade` or `limits`")
-    afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer `trials`")
+        raise BadTolerance(f"no tolerances; give rows, a {option('grade')} or {option('limits')}")
+    afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer {trials}")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= light_loss <= 1:
@@ -462,7 +465,9 @@ def tolerance_analysis(
     with torch.no_grad():
         nominal_quantity, *_ = study.compensated(study.half.new_zeros(1, len(tolerances)))
         if not bool(nominal_quantity.isfinite().all()):
-            raise BadTolerance("no ray of a field reaches the sensor of the nominal lens; give other `fields`")
+            raise BadTolerance(
+                f"no ray of a field reaches the sensor of the nominal lens; give other {option('fields')}"
+            )
         nominal = chosen.value(nominal_quantity[0])
         if increment is not None:
             tolerances = limited_to_change(tolerances, lambda errors: study.harm(errors)[0], increment)
@@ -499,7 +504,8 @@ def tolerance_analysis(
 
 
 #: Former names.
-Toleranced, tolerance = ToleranceAnalysis, tolerance_analysis
+Toleranced = ToleranceAnalysis
+tolerance = tolerance_analysis
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:

@@ -34,6 +34,7 @@ from raytrace.tracing.compiled import prepare
 from raytrace.tracing.focus import focus_moments, shift_to_focus
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
+from raytrace.words import option
 
 #: Angle of the astigmatism of an irregularity, degrees, and its change: the squares and the product of cos 2θ and
 #: sin 2θ have the means of a uniform distribution.
@@ -67,13 +68,13 @@ class AsBuilt:
 
     def __post_init__(self) -> None:
         if not 0 < self.weight < float("inf"):
-            raise ValueError(f"`weight` {self.weight:g} of the lens as built: expected a finite number above 0")
+            raise ValueError(f"{option('weight')} {self.weight:g} of the lens as built: expected a number above 0")
         if self.tolerances is not None and (self.grade or self.limits):
-            raise ValueError("`tolerances` are given: leave `grade` and `limits` out")
+            raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
 
     def words(self) -> str:
         """The settings in words."""
-        by = self.grade or "of " + ("`limits`" if self.limits else "`tolerances`" if self.tolerances else "its file")
+        by = self.grade or "of " + ("limits" if self.limits else "tolerances" if self.tolerances else "its file")
         return f"{by}, weight {self.weight:g}"
 
     def of(self, lens: Lens) -> "AsBuiltTerm":
@@ -93,7 +94,7 @@ class AsBuiltTerm:
         self.settings, rows = settings, settings.tolerances
         self.tolerances = tolerance_table(lens, settings.limits, grade=settings.grade) if rows is None else rows
         if not len(self.tolerances):
-            raise BadTolerance("no tolerances; give a `grade`, `limits` or `tolerances`")
+            raise BadTolerance(f"no tolerances; give a {option('grade')}, {option('limits')} or `tolerances`")
         self.limits = _focus_limits(lens, self.tolerances)
         self.perturbation = Perturbation(without_apertures(lens), self.tolerances)
         self.errors = design(self.tolerances).to(lens.wavelengths)
@@ -101,7 +102,7 @@ class AsBuiltTerm:
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
         self.weights = (shares[:, None] * self.sampling.weights).flatten()
         if not bool(torch.isfinite(self.expected(lens))):
-            raise Unlit("no ray of a field reaches the sensor of a lens of the sample; give other `fields`")
+            raise Unlit(f"no ray of a field reaches the sensor of a lens of the sample; give other {option('fields')}")
 
     def words(self) -> str:
         """The term in words."""

@@ -30,7 +30,7 @@ from raytrace.tracing.scene import Scene, trace_scene
 from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import without_apertures
 from raytrace.tracing.wavefront import wavefront_of, without
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, option
 
 _ACROSS = 10  # points across the pupil, by which lost light is measured
 
@@ -223,9 +223,12 @@ def criterion_of(
     without a merit function.
     """
     if word != "merit" and merit is not None:
-        raise ValueError(f"criterion {word!r}: `merit` belongs to the criterion merit; leave it out")
+        raise ValueError(f"criterion {word!r}: {option('merit')} belongs to the criterion merit; leave it out")
     if word != "psf" and (model, pixel, size) != ("gaussian", None, None):
-        raise ValueError(f"criterion {word!r}: `model`, `pixel` and `size` belong to the criterion psf; leave them out")
+        raise ValueError(
+            f"criterion {word!r}: {option('model')}, {option('pixel')} and {option('size')} belong to the criterion "
+            "psf; leave them out"
+        )
     if word in CRITERIA:
         return size_of_image(lens) if word == "rms" else CRITERIA[word]
     if word == "merit":

@@ -21,7 +21,7 @@ from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.geometry import semi_diameters
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, option
 
 _CHART = "Optimax Systems, Manufacturing Tolerance Chart"
 _GLASS = "ISO 12123"
@@ -181,7 +181,8 @@ def tolerance_table(
     words = _parsed(joined(limits))
     stored = tolerances_of(lens) if grade is None else ToleranceTable(())
     if not (grade or words or stored.rows):
-        message = 'the lens has no tolerances of its own: give `limits`, as "radius=0.1%", or `grade`, as "precision"'
+        limits_or_grade = f'{option("limits")}, as "radius=0.1%", or {option("grade")}, as "precision"'
+        message = f"the lens has no tolerances of its own: give {limits_or_grade}"
         raise BadTolerance(message)
     parts = parts_of(lens)
     drawn: dict[str, Any] = {"distribution": distribution, "sigmas": sigmas}

@@ -28,7 +28,7 @@ from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import rays
 from raytrace.tracing.trace import trace_lens
-from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean, named_value, option
 
 
 class NoDerivatives(RaytraceWarning):
@@ -135,9 +135,13 @@ def jacobian(
         if given is not None
     ]
     if of_rays and not (isinstance(of, str) and of in OF_RAYS):
-        raise ValueError(f"jacobian: `{of_rays[0]}` belongs to quantities of rays, {', '.join(OF_RAYS)}: leave it out")
+        raise ValueError(
+            f"jacobian: {option(of_rays[0])} belongs to quantities of rays, {', '.join(OF_RAYS)}: leave it out"
+        )
     if merit is not None and of != "merit":
-        raise ValueError("jacobian: `merit` belongs to `of=merit`: name it, or leave the merit function out")
+        raise ValueError(
+            f"jacobian: {option('merit')} belongs to {option('of', 'merit')}: name it, or leave the merit function out"
+        )
     perturbation = _perturbation(lens, tolerances, grade, limits)
     alone = vary is None and perturbation is not None
     model = DesignVariables(lens) if alone else design_variables(lens, vary)
@@ -145,7 +149,7 @@ def jacobian(
         if perturbation is not None:
             raise ValueError(
                 "jacobian: the residuals of a merit function have derivatives by design variables alone; for errors "
-                "give `of` a function, as lambda lens: rt.spot(lens).whole.rms_radius"
+                f"give {option('of')} a function, as lambda lens: rt.spot(lens).whole.rms_radius"
             )
         quantity, derivatives = _of_merit(model, lens, merit)
     else:
@@ -156,7 +160,7 @@ def jacobian(
         else:
             known = (*OF_RAYS, "merit")
             raise ValueError(
-                f"jacobian: `of` is {named_value(of)}; expected {', '.join(known)} or a function of a lens"
+                f"jacobian: {option('of')} is {named_value(of)}; expected {', '.join(known)} or a function of a lens"
                 + (did_you_mean(of, known) if isinstance(of, str) else "")
             )
         errors = 0 if perturbation is None else len(perturbation.rows)
@@ -181,7 +185,7 @@ def _perturbation(
 ) -> Perturbation | None:
     """The lens with the errors of tolerances, None without tolerances."""
     if tolerances is not None and (grade or limits):
-        raise ValueError("jacobian: `tolerances` are given: leave `grade` and `limits` out")
+        raise ValueError(f"jacobian: `tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if tolerances is None and not (grade or limits):
         return None
     return Perturbation(lens, tolerance_table(lens, limits, grade=grade) if tolerances is None else tolerances)
@@ -193,7 +197,7 @@ def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -
         number = function(lens)
     if not isinstance(number, Tensor):
         raise TypeError(
-            f"jacobian: `of` returns {named_value(number)}; expected a tensor, as of lambda lens: "
+            f"jacobian: {option('of')} returns {named_value(number)}; expected a tensor, as of lambda lens: "
             "rt.spot(lens).whole.rms_radius"
         )
     if not isinstance(number, MovingTensor):

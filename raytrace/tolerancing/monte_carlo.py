@@ -19,9 +19,9 @@ from raytrace.tracing.compiled import WORTH_COMPILING, prepare
 
 _JOURNAL = Kind(
     damaged=BadTolerance,
-    advice="give a new name for `checkpoint`",
+    advice="give a new name for the checkpoint",
     other=BadTolerance,
-    refusal="{path} holds the trials of another study: {difference}; give a new name for `checkpoint`",
+    refusal="{path} holds the trials of another study: {difference}; give a new name for the checkpoint",
 )
 _TRIALS = record({"first": whole(), "rows": listed(listed(number(infinite=True)))})
 

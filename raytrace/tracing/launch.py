@@ -59,7 +59,7 @@ from raytrace.tracing.aiming import aim_at_image, aim_at_stop
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import CONES, Beam, FirstOrder, axial_beam, cone_angle, field_scale
 from raytrace.tracing.trace import aiming_of, at_stop, is_bent
-from raytrace.words import RaytraceWarning, calling_level, named_value
+from raytrace.words import RaytraceWarning, calling_level, named_value, option
 
 
 class MarginalRayLost(RaytraceWarning):
@@ -83,7 +83,7 @@ def rays(
     if pupil is None:
         pupil = gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device)
     points = pupil[0] if isinstance(pupil, (tuple, list)) and pupil else pupil
-    expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.gauss_rings(6)"
+    expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.maths.gauss_rings(6)"
     if not isinstance(points, Tensor):
         raise TypeError(f"rays: `pupil` is {named_value(pupil)}; {expected}")
     if points.dim() != 2 or len(points) != 2:
@@ -586,7 +586,8 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
     return (
         f"field {field}: rays miss the stop, whose semi-diameter is {float(beams.radius):.4g} mm: the chief ray "
         f"{_words(beams.chief[f], 'centre')}, marginal rays {_words(beams.marginal[f], 'rim')}"
-        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')"
+        f"{many if len(worst) > 1 else ''}; {option('ray_aiming', 'real')} aims them, in Python "
+        "lens.at(ray_aiming='real')"
     )
 
 

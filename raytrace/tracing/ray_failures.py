@@ -15,7 +15,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import axial_beam
 from raytrace.tracing.trace import Crossing, lens_steps, trace_lens
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, option
 
 #: Status of a ray, and its wording at a surface.
 FATES = {
@@ -134,7 +134,7 @@ def warn_of_failures(
         for words, colours in wavelengths_of.items():
             _warn(f"{prefix}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
-        _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")
+        _warn(f"{hint}; see {option('f_number')} and {option('entrance_pupil_diameter')}")
 
 
 @torch.no_grad()
@@ -147,7 +147,7 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
     primary = lens.primary[None]
     F, P = tried.shape[1], pupil.shape[1]
-    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer `fields`")
+    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer {fields}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of aiming: the failures are reported below
         rays = launch(lens, pupil, fields=tried, wavelengths=primary)
@@ -169,11 +169,16 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
 
 def _help(lens: Lens, fields: Tensor | None) -> str:
     if hint := beam_hint(lens):
-        return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
+        return f"{hint}; see {option('f_number')} and {option('entrance_pupil_diameter')}"
     if fields is not None:
         largest = float(lens.fields.extent)
-        return f"the fields of the lens reach {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
-    return "give other fields by `fields`, a smaller beam by `f_number` or `entrance_pupil_diameter`"
+        return (
+            f"the fields of the lens reach {largest:g} {FIELD_UNITS[lens.fields.kind]}, give {option('fields')} within"
+        )
+    return (
+        f"give other fields by {option('fields')}, a smaller beam by {option('f_number')} or "
+        f"{option('entrance_pupil_diameter')}"
+    )
 
 
 def beam_hint(lens: Lens) -> str:

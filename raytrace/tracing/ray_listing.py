@@ -26,7 +26,7 @@ from raytrace.tracing.launch import rays as launched
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import STATUS, LostRays
 from raytrace.tracing.trace import axial_path, sequence_of, steps, trace_lens
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, option
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))
 _LOST = {_MISS: "missed", _TIR: "were totally reflected at", _VIGNETTED: "were vignetted at"}
@@ -172,19 +172,20 @@ def trace(
 ) -> Traced:
     """Rays on the image surface, and a table of their positions and directions surface by surface.
 
-    rays: in front of surface 1, as `rt.rays` returns them, or a table of rays (.csv) with columns x, y, z, l, m, n and
-    optionally wavelength; rays without one have that of `wavelengths`, by default the primary one. By default: chief,
-    upper, lower and side ray of every object distance, field and wavelength, batch shape (D, F, W, 4), or (F, W, 4) for
-    the lens's distance; fields as for `rt.rays`, wavelengths the primary one unless given. Rays of a batch of lenses
-    have their axis first, (3, L, …). Paths count from the wavefront of the object point that passes the vertex of
-    surface 1.
+    rays: in front of surface 1, as `rt.tracing.rays` returns them, or a table of rays (.csv) with columns x, y, z, l,
+    m, n and optionally wavelength; rays without one have that of `wavelengths`, by default the primary one. By default:
+    chief, upper, lower and side ray of every object distance, field and wavelength, batch shape (D, F, W, 4), or (F, W,
+    4) for the lens's distance; fields as for `rt.tracing.rays`, wavelengths the primary one unless given. Rays of a
+    batch of lenses have their axis first, (3, L, …). Paths count from the wavefront of the object point that passes the
+    vertex of surface 1.
     """
     labels, lens = None, aligned(lens, 3)
     if rays is None:
         launched, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
-            message = "`object_distances` and `fields` change nothing: a table defines where its rays start"
+            placed = f"{option('object_distances')} and {option('fields')}"
+            message = f"{placed} change nothing: a table defines where its rays start"
             warnings.warn(message, ChangesNothing, stacklevel=calling_level())
         launched = rays if isinstance(rays, Rays) else read_rays(rays, lens)
     wavelength = launched.wavelength

@@ -203,7 +203,7 @@ def arrivals(
     F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
     L = lens.count or 1
     count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
-    helps = "ask for fewer, or by `rays`, which keeps none"
+    helps = "ask for fewer, or by {rays}, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
     size = piece(RAY_BYTES * F * W * P)  # lenses at once; a lens whose fields exceed a chunk is split by fields
     lenses = [lens] if size >= L else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]

@@ -1,4 +1,4 @@
-"""Viewer: a lens whose numbers are turned while its figures are looked at, in a browser or a notebook.
+"""Viewer: sliders change the numbers of a lens, and its figures follow, in a browser or a notebook.
 
     state.py        the lens that is edited: a state and an event give the next state
     compute.py      numbers and drawings of a state, by the library's analyses

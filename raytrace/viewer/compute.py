@@ -7,9 +7,11 @@ the warnings of the analyses, `remarks`.
 import dataclasses
 import math
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from raytrace.analysis.chief import field_curvature_of
@@ -43,10 +45,10 @@ _DIGITS = 5  # of the cross section
 def curves(values: Tensor) -> list:
     """Numbers of a drawing, to six digits of the largest; None for nan."""
     numbers = style.array(values)
-    there = np.isfinite(numbers)
-    largest = np.abs(numbers[there]).max(initial=0.0)
-    found = numbers.round(5 - math.floor(math.log10(largest)) if largest > 0 else 0).tolist()
-    return found if there.all() else plain(found)
+    finite = np.isfinite(numbers)
+    largest = np.abs(numbers[finite]).max(initial=0.0)
+    rounded = numbers.round(5 - math.floor(math.log10(largest)) if largest > 0 else 0).tolist()
+    return rounded if finite.all() else plain(rounded)
 
 
 def hexadecimal(colour: str | tuple[float, ...]) -> str:
@@ -57,25 +59,32 @@ def hexadecimal(colour: str | tuple[float, ...]) -> str:
 
 
 class Drawing:
-    """Axes of a figure, of which the cross section of a lens takes lines and areas: the viewer draws these itself."""
+    """Axes that keep the lines and areas of a cross section as data; the page draws them."""
 
-    def __init__(self):
-        self.shapes, self.patches, self.limits = [], [], {"x": (0.0, 1.0), "y": (0.0, 1.0)}
+    def __init__(self) -> None:
+        self.shapes: list[dict[str, Any]] = []
+        self.patches: list = []
+        self.limits = {"x": (0.0, 1.0), "y": (0.0, 1.0)}
         self.dataLim = self
 
-    def plot(self, x, y, *marker, color="", linewidth=1.0, linestyle="", gid="", **look) -> None:
+    def plot(
+        self, x: ArrayLike, y: ArrayLike, *marker: str, color: str = "", linewidth: float = 1.0, linestyle: str = "",
+        gid: str = "", **look: object,
+    ) -> None:  # fmt: skip
         dashed = linestyle not in ("", "-") and not marker
         self._add(x, y, kind="mark" if marker else "line", stroke=color, width=linewidth, dashed=dashed, id=gid)
 
-    def fill(self, x, y, *, facecolor="", color="", gid="", **look) -> None:
+    def fill(
+        self, x: ArrayLike, y: ArrayLike, *, facecolor: str = "", color: str = "", gid: str = "", **look: object
+    ) -> None:
         self._add(x, y, kind="area", fill=facecolor or color, id=gid)
 
-    def _add(self, x, y, **look) -> None:
+    def _add(self, x: ArrayLike, y: ArrayLike, **look: Any) -> None:
         look |= {name: hexadecimal(look[name]) for name in ("stroke", "fill") if name in look}
         points = np.stack(np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float)))
         self.shapes.append({**look, "points": points})
 
-    def annotate(self, words: str, place: tuple, *more, **look) -> None:
+    def annotate(self, words: str, place: tuple, *more: object, **look: object) -> None:
         self.shapes.append({"kind": "text", "text": words, "points": np.array(place, dtype=float)[:, None]})
 
     def set_xlim(self, low: float, high: float) -> None:
@@ -86,7 +95,7 @@ class Drawing:
 
     def get_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower left and upper right corner of all shapes."""
-        points = np.concatenate([one["points"] for one in self.shapes], 1)
+        points = np.concatenate([shape["points"] for shape in self.shapes], 1)
         return points.min(1), points.max(1)
 
     def relim(self) -> None:
@@ -100,7 +109,7 @@ class Drawing:
     def document(self) -> dict:
         size = self.limits["x"][1] - self.limits["x"][0]
         places = _DIGITS - 1 - math.floor(math.log10(size))
-        shapes = [{**one, "points": one["points"].round(places).tolist()} for one in self.shapes]
+        shapes = [{**shape, "points": shape["points"].round(places).tolist()} for shape in self.shapes]
         return {"shapes": shapes, **self.limits}
 
 
@@ -141,21 +150,21 @@ def fans_of(lens: Lens, fields: Tensor) -> dict:
 def curvature_of(lens: Lens) -> dict:
     """Field curvature in mm over fields from the axis to the largest, (W, F) each."""
     fields = field_range(lens, FIELDS)
-    found = field_curvature_of(lens, fields)
-    tangential, sagittal = (masked(curve, found.valid).T for curve in (found.tangential, found.sagittal))
+    foci = field_curvature_of(lens, fields)
+    tangential, sagittal = (masked(curve, foci.valid).T for curve in (foci.tangential, foci.sagittal))
     return {"field": fields[1].tolist(), "tangential": curves(tangential), "sagittal": curves(sagittal)}
 
 
 def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = False) -> dict:
     """MTF (F, K) of rays, or of diffraction, up to the highest frequency in cycles/mm."""
     frequencies = torch.linspace(0.0, highest, FREQUENCIES, dtype=fields.dtype)
-    found = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
+    contrast: Any = mtf(lens, frequencies, fields=fields) if diffraction else geometric_mtf(lens, fields, frequencies)
     return {
         "frequency": frequencies.tolist(),
-        "tangential": curves(found.tangential),
-        "sagittal": curves(found.sagittal),
-        "limit": None if found.limit is None else curves(found.limit.amax((0, 1))),
-        "transfer": transfer(found),
+        "tangential": curves(contrast.tangential),
+        "sagittal": curves(contrast.sagittal),
+        "limit": None if contrast.limit is None else curves(contrast.limit.amax((0, 1))),
+        "transfer": transfer(contrast),
     }
 
 
@@ -175,7 +184,7 @@ def first_order_of(lens: Lens) -> list[dict]:
 
 
 def refresh(state: State) -> dict:
-    """All numbers that follow an edit. Analyses that the lens does not have are None, with reasons in `problems`."""
+    """All numbers of the page after an edit. Analyses that fail are None, with reasons in `problems`."""
     with torch.no_grad(), computed_once():
         analyses, problems = _analyses(state.lens, state.frequency)
         stored = _analyses(state.stored, state.frequency)[0] if state.compare else None
@@ -195,55 +204,58 @@ def _analyses(lens: Lens, highest: float) -> tuple[dict, list[str]]:
     """The analyses by name, and why some are None, or rays are lost."""
     lens, problems = _simple(lens), []
     fields = shown_fields(lens)
-    found = {
+    results: dict[str, Any] = {
         "fields": [field_label(lens, point) for point in fields.T.tolist()],
         "wavelengths": lens.wavelengths.tolist(),
         "field_colours": style.field_colours(fields.shape[1]),
-        "wavelength_colours": [hexadecimal(one) for one in style.wavelength_colours(lens.wavelengths.tolist())],
+        "wavelength_colours": [hexadecimal(colour) for colour in style.wavelength_colours(lens.wavelengths.tolist())],
     }
     for name, analysis in {
         "layout": lambda: layout_of(lens, fields),
         "spots": lambda: spots_of(lens, fields),
         "fans": lambda: fans_of(lens, fields),
         "mtf": lambda: (
-            found["spots"] and mtf_of(lens, fields, min(highest, least_reach(1e-3 * found["spots"]["half"])))
+            results["spots"] and mtf_of(lens, fields, min(highest, least_reach(1e-3 * results["spots"]["half"])))
         ),
         "curvature": lambda: curvature_of(lens),
         "first_order": lambda: first_order_of(lens),
     }.items():
         try:
-            found[name] = analysis()
+            results[name] = analysis()
         except (ValueError, RuntimeError, ArithmeticError) as error:
-            found[name] = None
+            results[name] = None
             problems.append(str(error))
-    dark = [f for f, radius in enumerate(found["spots"]["rms"] if found["spots"] else ()) if radius is None]
-    return found, _lost(lens, fields[:, dark]) if dark else problems
+    dark = [f for f, radius in enumerate(results["spots"]["rms"] if results["spots"] else ()) if radius is None]
+    return results, _lost(lens, fields[:, dark]) if dark else problems
 
 
 def _lost(lens: Lens, fields: Tensor) -> list[str]:
     """Where the rays of fields (2, F) end, none of which reaches the sensor."""
     pupil = hexapolar(4, dtype=lens.wavelengths.dtype)[0]
     failures = ray_failures(lens, pupil, fields=fields, wavelengths=lens.primary[None])
-    return [f"field {field_label(lens, one)}: {failures.words(f, 0)}" for f, one in enumerate(fields.T.tolist())]
+    return [f"field {field_label(lens, point)}: {failures.words(f, 0)}" for f, point in enumerate(fields.T.tolist())]
 
 
 def mtf_of_field(state: State, field: int) -> dict:
     """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
-    found = {"field": field, "mtf": None}
+    result: dict[str, Any] = {"field": field, "mtf": None}
     with torch.no_grad(), computed_once(), suppress(ValueError, RuntimeError, ArithmeticError):  # as `refresh` reports
         lens = _simple(state.lens)
         fields = shown_fields(lens)
         radius = field_spots(lens, fields=fields, rings=1)[0].geometric_radius.nan_to_num(0.0).max()
         if field < fields.shape[1] and least_reach(float(radius)) >= state.frequency / 3:
-            found["mtf"] = mtf_of(lens, fields[:, field : field + 1], state.frequency, diffraction=True)
-    return found
+            result["mtf"] = mtf_of(lens, fields[:, field : field + 1], state.frequency, diffraction=True)
+    return result
 
 
 def remarks(state: State) -> list[str]:
     """Rays that miss the stop, surfaces and gaps that cannot be made."""
     lens = _detached(state.lens)
     with torch.no_grad(), computed_once():
-        return [*filter(None, [unfilled(lens, field_points(None, like=lens))]), *(one.words for one in defects(lens))]
+        return [
+            *filter(None, [unfilled(lens, field_points(None, like=lens))]),
+            *(defect.words for defect in defects(lens)),
+        ]
 
 
 # -- the prescription
@@ -253,7 +265,7 @@ def prescription(state: State) -> dict:
     """The table of the lens and its conditions."""
     lens = _detached(state.lens)
     data = lens.optimization_data
-    follows = {word_of(one) for one in (data.solves if data else ())}
+    follows = {word_of(solve) for solve in (data.solves if data else ())}
     rows, last = [], len(lens.surfaces) - 1
     for k, surface in enumerate(lens.surfaces):
         numbers = {} if k == last else {"thickness": surface.thickness}
@@ -261,15 +273,15 @@ def prescription(state: State) -> dict:
             paths = parameter_paths(surface).items()
             numbers |= {name: number_at(surface, path) for name, path in paths}
         if surface.is_break:
-            numbers = {name: one for name, one in numbers.items() if name not in ("curvature", "conic")}
-        numbers = {name: 0.0 if one is None else float(one) for name, one in numbers.items()}
+            numbers = {name: value for name, value in numbers.items() if name not in ("curvature", "conic")}
+        numbers = {name: 0.0 if value is None else float(value) for name, value in numbers.items()}
         here = [{word.split(":")[0] for word in words if word.endswith(f":{k}")} for words in (state.vary, follows)]
         rows.append(
             {
                 "surface": k,
-                "cells": {name: plain(one) for name, one in numbers.items()},
+                "cells": {name: plain(value) for name, value in numbers.items()},
                 "sliders": {
-                    name: slider_ends(lens, k, name, one) for name, one in numbers.items() if math.isfinite(one)
+                    name: slider_ends(lens, k, name, value) for name, value in numbers.items() if math.isfinite(value)
                 },
                 "glass": None if k == last or surface.is_break else label(surface.glass),
                 "semi_diameter": surface.semi_diameter,

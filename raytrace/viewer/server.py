@@ -13,6 +13,7 @@ import sys
 import warnings
 import webbrowser
 from collections import OrderedDict
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import torch
@@ -34,7 +35,7 @@ def missing(error: ImportError) -> MissingExtra:
     return MissingExtra(f"the viewer needs {error.name}: install it by pip install 'raytrace[view]'", name=error.name)
 
 
-def application(lens: Lens, file: Path | None, token: str, port: int):
+def application(lens: Lens, file: Path | None, token: str, port: int) -> Callable:
     """The ASGI application of a lens. Every tab has a session of its own, which a reload of the tab resumes."""
     from starlette.applications import Starlette
     from starlette.concurrency import run_in_threadpool
@@ -47,7 +48,7 @@ def application(lens: Lens, file: Path | None, token: str, port: int):
     origins = {f"http://{host}" for host in hosts}
     sessions: OrderedDict[str, Session] = OrderedDict()
 
-    async def guard(request: Request, call_next) -> Response:
+    async def guard(request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
         given = request.query_params.get("token", "")
         origin = request.headers.get("origin")
         if request.headers.get("host") not in hosts:

@@ -33,7 +33,7 @@ from raytrace.viewer.state import (
     variables,
 )
 
-#: All events: those of a session, beside those of its state.
+#: All events: those of a session and those of its state.
 SESSION_EVENTS = {
     "open": Event({}),
     "save": Event({"path": TEXT, "overwrite": FLAG}),
@@ -52,7 +52,8 @@ class Optimisation:
     """An optimisation in a thread: `lens` of its last cycle, `merits` of all of them, and its result or failure."""
 
     def __init__(self, state: State):
-        self.lens, self.merits, self.is_stopped = state.lens, [], False
+        self.lens, self.is_stopped = state.lens, False
+        self.merits: list[float] = []
         rows = [row for row in requirements(state.lens) if row.weight != 0]
         self.required = [*dict.fromkeys(map(in_words, rows))]
         self.result: Optimized | None = None
@@ -76,7 +77,7 @@ class Optimisation:
     def words(self) -> str:
         count = f"{len(self.merits)} cycle{'' if len(self.merits) == 1 else 's'}"
         if self.result is not None:
-            missed = [str(one) for one in self.result.conditions if not one.met]
+            missed = [str(condition) for condition in self.result.conditions if not condition.met]
             before, after = self.result.merit_before, self.result.merit_after
             reason = STOPPED[self.result.stopped]
             return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *self._of_file, *missed])
@@ -95,7 +96,8 @@ class Session:
 
     def __init__(self, lens: Lens, file: Path | None = None):
         prepare()
-        self.state, self.file, self.optimisation = initial(lens), file, None
+        self.state, self.file = initial(lens), file
+        self.optimisation: Optimisation | None = None
         self._lock = threading.Lock()
 
     def answer(self, event: Mapping) -> dict:
@@ -148,8 +150,8 @@ class Session:
             return {**refresh(self.state), "optimisation": document, "message": work.failure}
         if work.merits or work.result:
             self.state = edited(self.state, work.result.lens if work.result else work.lens)
-        document["words"] += "; stopped" if stop else ""
-        return {"optimisation": document, **refresh(self.state)}
+        words = f"{work.words}; stopped" if stop else work.words
+        return {"optimisation": {**document, "words": words}, **refresh(self.state)}
 
     def save(self, path: str, *, overwrite: bool = False) -> str:
         """Write the lens in the format of the suffix; a file that exists is replaced if `overwrite`. In words."""

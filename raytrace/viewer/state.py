@@ -26,7 +26,7 @@ from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.plotting import style
 from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
-from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, path_of, with_number
 from raytrace.tracing.geometry import gaps
 from raytrace.tracing.launch import factors_at
@@ -48,11 +48,11 @@ _LONGEST = 4096  # characters of a text
 
 @dataclass(frozen=True)
 class State:
-    """What the viewer shows.
+    """The content of the viewer.
 
     lens, vary: the lens and its variables, words of the variable syntax; stored: the lens of the file, for comparison.
-    past, future: pairs (lens, vary), the latest last. merit: what is optimised, a key of `merit.KINDS` or "" for the
-    merit function of the file; frequency: the highest of the MTF, cycles/mm. compare: whether the stored lens is drawn
+    past, future: pairs (lens, vary), the latest last. merit: the merit function, a key of `merit.KINDS` or "" for that
+    of the file; frequency: the highest of the MTF, cycles/mm. compare: whether the stored lens is drawn
     too; dragged: the number that a slider moves; message: why the last event changed nothing.
     """
 
@@ -71,7 +71,7 @@ class State:
 def initial(lens: Lens) -> State:
     """The state of a lens as it was read, with the variables of its file."""
     data = lens.optimization_data
-    words = dict.fromkeys(word_of(one) for one in (data.variables if data else ()) if is_shown(lens, one))
+    words = dict.fromkeys(word_of(vary) for vary in (data.variables if data else ()) if is_shown(lens, vary))
     try:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
@@ -99,7 +99,7 @@ def reduce(state: State, event: Mapping) -> State:
 
 
 class Part(NamedTuple):
-    """A kind of value in an event: which values it admits, and its words for a message."""
+    """A kind of value in an event. admits: whether a value is of the kind; words: the kind in a message."""
 
     admits: Callable[[object], bool]
     words: str
@@ -126,14 +126,14 @@ FIELD = Part(lambda value: value is None or WHOLE.admits(value), "a whole number
 
 
 class Event(NamedTuple):
-    """A kind of event. parts: those that it may have, by their names; change: the state behind it."""
+    """A kind of event. parts: those that it may have, by their names; change: the state after it."""
 
     parts: Mapping[str, Part]
-    change: Callable[[State, Mapping], State] | None = None
+    change: Callable[[State, Mapping], State] = lambda state, event: state
 
 
 def refusal(event: Mapping, known: Mapping[str, Event]) -> str:
-    """Why an event is none of the known kinds, or which of its parts is none; empty if it is one."""
+    """Why an event is refused: an unknown kind, or a part that is unknown or has a wrong value; empty if it is not."""
     kind = event.get("type")
     if not isinstance(kind, str) or kind not in known:
         return f"unknown event {named_value(kind)}; expected one of {', '.join(known)}"
@@ -146,27 +146,27 @@ def refusal(event: Mapping, known: Mapping[str, Event]) -> str:
     return ""
 
 
-def word_of(one: Vary) -> str:
-    """A variable as a word of the variable syntax, "curvature:3"; of all configurations."""
-    return f"{one.quantity}:{one.surface}"
+def word_of(number: Vary | Solve) -> str:
+    """A variable or solve in the variable syntax, "curvature:3"; of all configurations."""
+    return f"{number.quantity}:{number.surface}"
 
 
-def is_shown(lens: Lens, one: Vary) -> bool:
-    """Whether the table has the number of a variable or solve: it has none of glasses and of other conditions."""
-    return one.quantity == "thickness" or one.quantity in parameter_paths(lens.surfaces[one.surface])
+def is_shown(lens: Lens, variable: Vary) -> bool:
+    """Whether the table has the number of a variable: glasses and conditions of the lens are not in it."""
+    return variable.quantity == "thickness" or variable.quantity in parameter_paths(lens.surfaces[variable.surface])
 
 
 def variables(state: State) -> list[str | Vary]:
     """The variables for `optimize`: those of the file with their bounds, others as words."""
     data = state.lens.optimization_data
-    of_file = [one for one in (data.variables if data else ()) if word_of(one) in state.vary]
+    of_file = [variable for variable in (data.variables if data else ()) if word_of(variable) in state.vary]
     return [*of_file, *(word for word in state.vary if word not in map(word_of, of_file))]
 
 
 def merit_of(state: State) -> Merit | None:
     """The merit function for `optimize`; None: the file's. The MTF is that at 1/4 and 1/2 of the highest frequency.
 
-    A chosen one replaces what the file says of the image; conditions, boundaries and other rows of the file remain.
+    A default merit function replaces rows of image quality; conditions, boundaries and other rows of the file remain.
     """
     if not state.merit:
         return None
@@ -176,7 +176,7 @@ def merit_of(state: State) -> Merit | None:
 
 
 def requirements(lens: Lens) -> Merit:
-    """The merit function of the file in which rows of the image, unless they are conditions, have no weight."""
+    """The merit function of the file, rows of image quality without weight unless they are conditions."""
     data = lens.optimization_data
     rows = data.merit if data else ()
     of_image = [row.operand in OF_IMAGE and row.weight > 0 for row in rows]
@@ -196,12 +196,12 @@ def in_words(row: Row) -> str:
 def number(text: object, what: str) -> float:
     """A number from a table or a slider. Raises ValueError for a text that is none, and for nan."""
     try:
-        found = float(str(text).strip().replace("−", "-").replace("∞", "inf"))
+        value = float(str(text).strip().replace("−", "-").replace("∞", "inf"))
     except ValueError:
-        found = math.nan
-    if math.isnan(found):
+        value = math.nan
+    if math.isnan(value):
         raise ValueError(f"{what}: {str(text)!r} is not a number; nothing was changed")
-    return found
+    return value
 
 
 def numbers(texts: str | Sequence, what: str, most: int) -> list[float]:
@@ -291,9 +291,9 @@ def solved(lens: Lens) -> Lens:
 
 def aperture_sizes(lens: Lens) -> dict[str, float]:
     """The paraxial beam by the kinds of system aperture that the viewer offers, the lens's own first."""
-    own, paraxial = {lens.aperture.kind: float(lens.aperture.value)}, first_order(lens)
+    stored, paraxial = {lens.aperture.kind: float(lens.aperture.value)}, first_order(lens)
     sizes = {"image_f_number": paraxial.f_number, "entrance_pupil_diameter": paraxial.entrance_pupil_diameter}
-    return own | {kind: float(size) for kind, size in sizes.items() if kind not in own}
+    return stored | {kind: float(size) for kind, size in sizes.items() if kind not in stored}
 
 
 # -- events
@@ -310,20 +310,20 @@ def edited(state: State, lens: Lens, vary: tuple[str, ...] | None = None, drag: 
 def _dragged(state: State, event: Mapping, lens: Lens, key: str) -> State:
     """The lens of an event of the slider `key`, or of its text field, which ends the drag."""
     drag = bool(event.get("drag"))
-    found = edited(state, lens, drag=key if drag or state.dragged == key else "")
-    return found if drag else dataclasses.replace(found, dragged="")
+    after = edited(state, lens, drag=key if drag or state.dragged == key else "")
+    return after if drag else dataclasses.replace(after, dragged="")
 
 
 def _edit(state: State, event: Mapping) -> State:
     surface, quantity = event["surface"], event["quantity"]
-    named = "curvature" if quantity == "radius" else quantity
+    dragged = "curvature" if quantity == "radius" else quantity
     lens = with_value(state.lens, surface, quantity, event["value"])
-    return _dragged(state, event, lens, f"{named}:{surface}")
+    return _dragged(state, event, lens, f"{dragged}:{surface}")
 
 
 def _vary(state: State, event: Mapping) -> State:
     word = f"{event['quantity']}:{event['surface']}"
-    chosen = tuple(one for one in state.vary if one != word)
+    chosen = tuple(other for other in state.vary if other != word)
     if event.get("on"):
         design_variables(state.lens, word)
         chosen = (*chosen, word)
@@ -336,7 +336,8 @@ def _fields(state: State, event: Mapping) -> State:
     lens, axis, values = state.lens, event.get("axis", "y"), numbers(event["values"], "fields", MOST_FIELDS)
     old = lens.fields
     if len(values) == len(old.y):
-        fields = dataclasses.replace(old, **{axis: old.y.new_tensor(values)})
+        heights = old.y.new_tensor(values)
+        fields = dataclasses.replace(old, x=heights) if axis == "x" else dataclasses.replace(old, y=heights)
     elif axis == "x":
         raise ValueError(f"x of the fields: found {len(values)} numbers; this lens has {len(old.y)} fields")
     else:
@@ -363,7 +364,7 @@ def _wavelengths(state: State, event: Mapping) -> State:
     lens, values = state.lens, numbers(event["values"], "wavelengths", MOST_WAVELENGTHS)
     old, weights, primary = lens.wavelengths.tolist(), lens.wavelength_weights.tolist(), float(lens.primary)
     same = len(values) == len(old)
-    places = [old.index(one) if one in old else k if same else None for k, one in enumerate(values)]
+    places = [old.index(value) if value in old else k if same else None for k, value in enumerate(values)]
     if primary in values or not same:
         number = min(range(len(values)), key=lambda k: abs(values[k] - primary))
     else:

@@ -7,6 +7,7 @@ from typing import Any
 from raytrace.system.lens import Lens
 from raytrace.viewer.server import STATIC, missing, serve
 from raytrace.viewer.session import Session
+from raytrace.viewer.state import State
 
 
 def view(lens: Lens, *, port: int | None = None, browser: bool = True) -> Any:
@@ -28,7 +29,7 @@ def in_notebook() -> bool:
     return shell is not None and "IPKernelApp" in shell.config
 
 
-def widget_of(lens: Lens):
+def widget_of(lens: Lens) -> Any:
     """The widget; its messages are those of the server, numbered."""
     try:
         import anywidget
@@ -46,12 +47,12 @@ def widget_of(lens: Lens):
             self.session = Session(lens)
             self.on_msg(self._answer)
 
-        def _answer(self, widget, content: dict, buffers: list) -> None:
+        def _answer(self, widget: object, content: dict, buffers: list) -> None:
             with warnings.catch_warnings(action="ignore"):  # the page lists them as remarks
                 self.send({"number": content["number"], "reply": self.session.answer(dict(content["event"]))})
 
         @property
-        def state(self):
+        def state(self) -> State:
             return self.session.state
 
         @property

@@ -11,8 +11,8 @@
 | pupil         | matrix Fourier transform of the residual path                                                   |
 | propagation   | radial engine of round elements; Fresnel and angular-spectrum propagation                       |
 | mixed         | round elements with steps in contact with smooth ones that are not round                        |
-| compute       | `rt.wave_psf`, `rt.elements`, the result and caustics; figures                                  |
-| hybrid        | an element on a surface of a traced lens: `rt.hybrid_psf`, `rt.element_lens`                    |
+| compute       | `wave_psf`, `phase_elements`, the result and caustics; figures                                   |
+| hybrid        | an element on a surface of a traced lens: `hybrid_psf`, `element_lens`                          |
 
 To add:
 

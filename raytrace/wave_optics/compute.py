@@ -32,7 +32,7 @@ from raytrace.wave_optics.fabrication import height_range
 from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture, is_round
-from raytrace.words import did_you_mean
+from raytrace.words import did_you_mean, option
 
 _KEPT = 8  # sums that a memo keeps
 
@@ -258,17 +258,17 @@ def wave_psf(
 ) -> ElementPsf:
     """PSFs of a phase element, integrated over pixels, for points on the axis over depth and wavelength.
 
-    element, and all up to catalog: as for `rt.elements`; or an Element (`rt.element` makes one of an array), or several
-    in contact, in whose numbers the kernels are differentiable; of the options up to catalog they use `sensor` (mm from
-    the element) and `exact` alone. depths: mm, inf allowed; wavelengths: µm; pixel: mm; size: pixels across a window
-    around the axis; with an even size the axis is a corner of four pixels. A kernel holds the light in each pixel, 1 is
-    all light through the aperture.
-    engine: "auto" takes "radial" (Hankel integrals) for round elements, else "pupil" (matrix Fourier transform);
-    "fresnel" and "angular_spectrum" propagate the field by FFT, as references. tol: bound on the predicted relative L2
-    error of a kernel; samples: across the aperture, instead. `.plan` of the result has both.
-    Kernels that would take too much memory at once are computed one by one. Raises ValueError for options that exclude
-    each other, AliasedSampling for samples that would repeat the kernel inside the window, budget.OverBudget where one
-    kernel alone would take too much.
+    element, and all up to catalog: as for `rt.wave_optics.phase_elements`; or an Element (of an array by
+    `rt.wave_optics.phase_element`), or several in contact, in whose numbers the kernels are differentiable; of the
+    options up to catalog they use `sensor` (mm from the element) and `exact` alone. depths: mm, inf allowed;
+    wavelengths: µm; pixel: mm; size: pixels across a window around the axis; with an even size the axis is a corner of
+    four pixels. A kernel holds the light in each pixel, 1 is all light through the aperture. engine: "auto" takes
+    "radial" (Hankel integrals) for round elements, else "pupil" (matrix Fourier transform); "fresnel" and
+    "angular_spectrum" propagate the field by FFT, as references. tol: bound on the predicted relative L2 error of a
+    kernel; samples: across the aperture, instead. `.plan` of the result has both. Kernels that would take too much
+    memory at once are computed one by one. Raises ValueError for options that exclude each other, AliasedSampling for
+    samples that would repeat the kernel inside the window, budget.OverBudget where one kernel alone would take too
+    much.
     """
     if isinstance(element, str | os.PathLike):
         name = str(element)
@@ -293,8 +293,9 @@ def wave_psf(
         fixed = {"glass": glass, "index": index, "pitch": pitch, "span": span, "levels": levels}
         fixed |= {"design_wavelength": design_wavelength}
         fixed |= {"aperture": None if aperture == 5.0 or math.isclose(aperture, diameter) else aperture}
-        if option := next((option for option, number in fixed.items() if number is not None), ""):
-            raise ValueError(f"`{option}` belongs to an element by name or from a file; an Element has it already")
+        if parameter := next((word for word, number in fixed.items() if number is not None), ""):
+            message = "belongs to an element by name or from a file; an Element has it already"
+            raise ValueError(f"{option(parameter)} {message}")
         name = " + ".join(part.kind.words for part in parts)
     for material in {id(part.glass.coefficients): part.glass for part in parts}.values():
         check_unit(torch.tensor(wavelengths), [material])
@@ -332,7 +333,7 @@ def phase_elements(
     """The elements in contact of a name, or of a file of heights.
 
     Names: ideal, singlet, fresnel, multifocal, multifocal-refractive, cubic, cubic-refractive, achromat, hybrid; cubic
-    and hybrid are two elements, a lens and a plate. `rt.element` makes an element of an array.
+    and hybrid are two elements, a lens and a plate. `rt.wave_optics.phase_element` makes an element of an array.
 
     aperture: diameter, mm. Of a named element sensor, focus: mm, the distances of its design; design_wavelength: µm,
     0.55 by default; levels: steps of a wave's height; exact: true spheres. Of a file as for `read_element`; index:
@@ -342,25 +343,25 @@ def phase_elements(
     name = str(element)
     if name in BASELINES:
         of_maps = {"glass": glass, "index": index, "pitch": pitch, "span": span}
-        if option := next((option for option, number in of_maps.items() if number is not None), ""):
-            raise ValueError(f"`{option}` belongs to a height map; it is fixed for the element {name}")
+        if parameter := next((word for word, number in of_maps.items() if number is not None), ""):
+            raise ValueError(f"{option(parameter)} belongs to a height map; it is fixed for the element {name}")
         if levels and name not in STEPPED:
-            raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
+            raise ValueError(f"{option('levels')}: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
         wavelength = design_wavelength or DESIGN
         conditions = aim(radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=wavelength, exact=exact)
         return baseline(name, conditions, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in ELEMENT_FORMATS:
         raise ValueError(
-            f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
+            f"{option('element', name)}: neither a named element ({', '.join(BASELINES)}) nor a height map "
             f"({', '.join(FORMATS)}) nor a smooth element ({SMOOTH}){did_you_mean(name, BASELINES)}"
         )
     if index is not None:
         if glass:
-            raise ValueError("`glass` and `index` exclude each other: both specify the material")
+            raise ValueError(f"{option('glass')} and {option('index')} exclude each other: both specify the material")
         try:
             glass = from_table(wavelengths, index)
         except ValueError as error:
-            raise ValueError(f"`index`: {error}") from error
+            raise ValueError(f"{option('index')}: {error}") from error
     part = read_element(
         element,
         aperture=aperture,
@@ -381,7 +382,7 @@ def _kernels(scene: WaveScene, windows: Sequence[Grid], chosen: Plan, progress: 
     """
     D, W = len(scene.depths), len(scene.wavelengths)
     whole = chosen.memory < min(_CHUNK, allowed_bytes())
-    helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
+    helps = "take fewer by {samples} or a larger {tol}, a smaller window by {size}"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)

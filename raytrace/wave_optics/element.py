@@ -20,7 +20,7 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import Glass, constant, index
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.zernike import noll, polynomials
-from raytrace.words import with_article
+from raytrace.words import option, with_article
 
 #: Sizes of features, mm: diamond turning of PMMA, and etching of fused silica.
 TURNED, ETCHED = 3.69e-3, 2e-3
@@ -191,12 +191,12 @@ def phase_element(
     if not aperture > 0:
         raise ValueError(f"aperture {aperture:g} mm; expected a positive diameter")
     if KINDS[kind].is_flat != (pitch is not None):
-        needs = "needs `pitch`, mm" if pitch is None else "is smooth and has no `pitch`"
+        needs = f"needs {option('pitch')}, mm" if pitch is None else f"is smooth and has no {option('pitch')}"
         raise ValueError(f"a profile of {profile} {needs}")
     if pitch is not None and not pitch > 0:
         raise ValueError(f"pitch {pitch:g} mm; expected a positive number")
     if levels and not design_wavelength:
-        raise ValueError("`levels` are steps of one wave's height; give `design_wavelength`, µm")
+        raise ValueError(f"{option('levels')} are steps of one wave's height; give {option('design_wavelength')}, µm")
     if isinstance(glass, str):
         glass = find_glass(glass)
     elif not isinstance(glass, Glass):
@@ -216,7 +216,7 @@ def check_fills(profile: Profile, aperture: float, place: str = "") -> None:
     if across + 2 * float(profile.pitch) < aperture:
         raise ValueError(
             f"{place}the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
-            f"give `aperture={across:.6g}`"
+            f"give {option('aperture', f'{across:.6g}')}"
         )
 
 
@@ -227,8 +227,8 @@ def in_contact(elements: Element | Sequence[Element]) -> tuple[Element, ...]:
         wrong = next(part for part in parts if not isinstance(part, Element))
         kind = with_article(type(wrong if isinstance(elements, tuple | list) else elements).__name__)
         raise TypeError(
-            f"{kind} is no phase element; expected an Element or several: rt.elements(name or file) or, of an array "
-            "of heights, rt.element(heights, pitch=…, aperture=…, glass=…)"
+            f"{kind} is no phase element; expected an Element or several: rt.wave_optics.phase_elements(name or file) "
+            "or, of an array of heights, rt.wave_optics.phase_element(heights, pitch=…, aperture=…, glass=…)"
         )
     return parts
 

@@ -21,6 +21,7 @@ from raytrace.stores import Unfit, either, exactly, listed, number, parsed, reco
 from raytrace.wave_optics.element import Element, EvenPowers, Profile, Zernike, check_fills, has_features
 from raytrace.wave_optics.fabrication import fabricated, height_range, wrapped
 from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
+from raytrace.words import option
 
 #: Suffix of smooth elements, and their profiles by their name in the file.
 SMOOTH = ".json"
@@ -109,7 +110,7 @@ def read_element(
         if label is None or label.profile is None:
             raise HeightMapError("is no smooth element: expected the coefficients of one", file)
         if pitch is not None or span is not None:
-            raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
+            raise ValueError(f"{file}: is smooth; {option('pitch')} and {option('span')} belong to a height map")
         profile, is_fixed = label.profile, isinstance(label.profile, Zernike)
         if aperture > label.aperture * (1 + 1e-9) or (is_fixed and aperture < label.aperture * (1 - 1e-9)):
             raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
@@ -122,15 +123,16 @@ def read_element(
         glass = label.glass
     if glass is None:
         raise ValueError(
-            f"{path}: has no material (there is no {_label_of(path).name}); give `glass=NAME`, as PMMA, or "
-            "`index=N` for each wavelength"
+            f"{path}: has no material (there is no {_label_of(path).name}); give {option('glass', 'NAME')}, as PMMA, "
+            "or "
+            f"{option('index', 'N')} for each wavelength"
         )
     element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass)
     if not (design_wavelength or levels):
         return element
     design = design_wavelength or (None if label is None else label.design_wavelength)
     if not design:
-        raise ValueError(f"{path}: has no design wavelength; give `design_wavelength`")
+        raise ValueError(f"{path}: has no design wavelength; give {option('design_wavelength')}")
     return wrapped(element, design, levels=levels)
 
 

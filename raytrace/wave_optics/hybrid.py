@@ -177,11 +177,12 @@ def hybrid_psf(
     elements are thin: obliquity inside them, and the other way through the lens of rays that they deflect, are not,
     nor are Fresnel losses; rays are not traced through them.
 
-    elements: of `rt.elements` or `rt.element`, at least as wide as the beam at the stop, which must lie in air. fields:
-    y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; by default
-    those of the lens. pixel, size: pitch in mm and number of pixels around the chief ray at the primary wavelength,
-    which they follow in the derivatives too. order: of the pupil sampling, -2 … 5 as for `rt.Wave`; a higher one checks
-    convergence, the error is not estimated. Differentiable in the numbers of the elements and of the lens.
+    elements: of `rt.wave_optics.phase_elements` or `rt.wave_optics.phase_element`, at least as wide as the beam at the
+    stop, which must lie in air. fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,)
+    mm; wavelengths: (W,) µm; by default those of the lens. pixel, size: pitch in mm and number of pixels around the
+    chief ray at the primary wavelength, which they follow in the derivatives too. order: of the pupil sampling, -2 … 5
+    as for `rt.psf_models.Wave`; a higher one checks convergence, the error is not estimated. Differentiable in the
+    numbers of the elements and of the lens.
 
     Raises ValueError for a stop between other media than air and a beam wider than an element, TooCoarse where more
     than 400,000 rays would be needed.

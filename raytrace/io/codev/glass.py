@@ -39,6 +39,7 @@ from raytrace.io.source import (
 )
 from raytrace.materials.catalogs import Catalog, UnknownGlass, find_glass, plain_names, same_catalog
 from raytrace.materials.glass import AIR, FORMULAS, LINES, Glass, constant, from_table, mil_glass, refractive_index
+from raytrace.words import option
 
 #: Formula of a private glass by its word: n² = C1 + C2 λ² + C3 λ⁻² + C4 λ⁻⁴ + …, λ in µm.
 FORMULA_WORDS = {"LAU": "schott"}
@@ -153,7 +154,7 @@ def _refuse_estimates(name: str, waves: Sequence[float], error: float, *, place:
         report.substituted.add(name.upper())
         report.warn(f"{estimate}, as requested", place)
     else:
-        ways = f"--substitute {name}=GLASS, or {name}={FORMULA} to accept the estimate (`substitute`)"
+        ways = f"{option('substitute', f'{name}=GLASS')}, or {name}={FORMULA} to accept the estimate"
         message = f"{estimate}; expected {_MOST_ERROR:.0e} at most: name the intended glass by {ways}"
         raise LensFileError(message, place)
 

@@ -43,6 +43,7 @@ from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose, undone
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
+from raytrace.words import option
 
 #: Digits of a written coefficient of a phase, enough to read back the same number through two roundings.
 _DIGITS = 40
@@ -135,7 +136,7 @@ def _aperture(aperture: SystemAperture, first: Surface, place: Place) -> str:
     if keyword is None or (keyword == "FNO" and not bool(torch.isinf(first.thickness).all())):
         where = " of an object at a finite distance" if keyword else ""
         message = f"the aperture {aperture.kind.replace('_', ' ')}{where}, which a .seq file does not hold"
-        raise LensFileError(f"{message}; set `entrance_pupil_diameter` instead", place)
+        raise LensFileError(f"{message}; set {option('entrance_pupil_diameter')} instead", place)
     return f"{keyword} {exact(aperture.value, 'system aperture', place)}"
 
 

@@ -152,9 +152,10 @@ def _seidel(state: LensState, wavelength: int) -> tuple[Number, ...]:
     y, (y_bar, slope) = state.marginal_height, chief_ray_of(state)
     omega, omega_bar = n[0] * y / state.object_distance, n[0] * slope
     rays = [ynu(*ray, powers, gaps)[:-1] for ray in ((y, omega), (y_bar, omega_bar))]
-    marginal, chief = (tuple(listed(column, state.count) for column in zip(*ray, strict=True)) for ray in rays)
+    columns = (zip(*ray, strict=True) for ray in rays)
+    marginal, chief = ((listed(heights, state.count), listed(slopes, state.count)) for heights, slopes in columns)
     vertex = listed(c[1:-1], state.count)
-    indices = tuple(listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0))
+    indices = listed([n[k - 1] for k in surfaces], state.count), listed([n[k] for k in surfaces], state.count)
     invariant = omega_bar * y - omega * y_bar
     curvature, conic, a4 = (state.of_surfaces(name)[1:-1] for name in ("curvature", "conic", "a4"))
     departure = departure_from_sphere(curvature, 1 + conic, a4, vertex)

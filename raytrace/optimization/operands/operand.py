@@ -20,7 +20,7 @@ from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import joined
 from raytrace.system.surface import is_flat
 from raytrace.tracing.launch import is_at_infinity
-from raytrace.words import RaytraceError, did_you_mean
+from raytrace.words import RaytraceError, did_you_mean, option
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,8 @@ def conventions_of(words: "Conventions | str | Sequence[str] | None") -> Convent
         if name not in CHOICES or not sign:
             known = ", ".join(CHOICES)
             raise ValueError(
-                f"`conventions`: {word!r}: expected one of {known}, = and a choice{did_you_mean(name, CHOICES)}"
+                f"{option('conventions')}: {word!r}: expected one of {known}, = and a "
+                f"choice{did_you_mean(name, CHOICES)}"
             )
         choices[name] = choice.replace("-", " ")
     return Conventions(**choices)

@@ -39,7 +39,7 @@ _LEAST = 1e-9  # errors below are rounding
 
 @style.styled
 def trace_figure(rows: Sequence[Mapping]) -> Figure:
-    """Rows of `bench trace` as mappings: speed over the number of rays, a panel for each task.
+    """Rows of `bench_trace.py` as mappings: speed over the number of rays, a panel for each task.
 
     Only rows with the optical path are drawn: all tracers compute it, so that they are seen at the same task.
     """
@@ -54,7 +54,7 @@ def trace_figure(rows: Sequence[Mapping]) -> Figure:
 
 @style.styled
 def speed_figure(rows: Sequence[Mapping]) -> Figure:
-    """Rows of `bench speed` as mappings; those forward count, a panel for each dtype."""
+    """Rows of `bench_speed.py` as mappings; those forward count, a panel for each dtype."""
     rows = [row for row in rows if row["what"] == "forward"]
     dtypes = {row["dtype"]: row["dtype"] for row in rows}
 
@@ -94,7 +94,7 @@ def _speeds(rows: Sequence[Mapping], by: str, titles: Mapping[str, str], names: 
 
 @style.styled
 def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str]) -> Figure:
-    """Rows of `bench psf` as mappings: time over error, a panel for each case, samplings from coarse to fine.
+    """Rows of `bench_psf.py` as mappings: time over error, a panel for each case, samplings from coarse to fine.
 
     titles: of the panels, by lens and field. Drawn are float64 rows of a fixed sampling: float32 and rows of a
     tolerance repeat them.

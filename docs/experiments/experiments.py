@@ -1,4 +1,4 @@
-"""Kit of the scripts in `docs/experiments`: a grid of cases, a store that resumes, a page with tables and figures."""
+"""Shared by the scripts: a grid of cases, a store that resumes, a page with tables and figures."""
 
 import itertools
 import sys
@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from pages import write_page
 
 from raytrace.files import write_atomically, write_json, write_text
 from raytrace.imaging.training import RUN
 from raytrace.maths.arrays import ArrayError, read_npz
-from raytrace.pages import write_page
 from raytrace.plotting.style import save
 from raytrace.stores import Folder, Unfit, number, read_document, read_file
 

@@ -1,4 +1,4 @@
-"""Peers: Optiland, its trace and its PSFs, and the trace of ray-optics, on the same lens and rays.
+"""Peers of the scripts bench_*.py: Optiland, its trace and PSFs, and the trace of ray-optics, on equal lenses and rays.
 
 Of Optiland's trace `optic.surfaces.trace(rays, skip=1, record=False)` is timed, the loop over surfaces alone: no
 paraxial launch, no ray aiming, no snapshots, media of constant index. Its grad mode is off, so that only the variables
@@ -24,6 +24,7 @@ import numba
 import numpy as np
 import optiland.backend as be
 import torch
+from bench_reference import shape_of
 from optiland.analysis import IncoherentIrradiance
 from optiland.materials import IdealMaterial
 from optiland.optic import Optic
@@ -37,7 +38,7 @@ from optiland.tolerancing.monte_carlo import MonteCarlo
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from raytrace.bench.measure import DTYPES, Tracer, clock, name_of, shape_of, squared_radius, variables
+from raytrace.bench.measure import DTYPES, Tracer, clock, name_of, squared_radius, variables
 from raytrace.bench.psf import Case, Method, Truth
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import Grid
@@ -63,7 +64,7 @@ class Optiland(Tracer):
     def __init__(self, lens: Lens, dtype: torch.dtype, *, backend: str, by_indices: bool = False):
         self.name = f"Optiland, {backend}"
         self.dtype, self.backend, self.by_indices = dtype, backend, by_indices
-        self.has_gradient = backend == "torch"
+        self.has_gradient, self.with_path, self.device = backend == "torch", True, "cpu"
         self.lens, self.wavelength = to(lens, dtype=dtype), float(lens.primary)
         self.indices = media(self.lens, self.lens.primary)
         self.prepare()
@@ -79,19 +80,21 @@ class Optiland(Tracer):
             self.forward(Rays(torch.zeros_like(axis), axis, torch.ones(2, dtype=torch.bool)))  # compiles
 
     def prepare(self) -> None:
-        """Optiland's back end, precision and grad mode are global."""
+        """Set Optiland's back end, precision and grad mode, which are global."""
         be.set_backend(self.backend)
         if self.backend == "torch":
             be.set_precision(name_of(self.dtype))
             be.grad_mode.disable()
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        self.prepare()
         with torch.no_grad():
             end = self._trace(rays)
         return torch.stack([torch.as_tensor(end.x), torch.as_tensor(end.y)]), torch.as_tensor(end.opd)
 
     def gradient(self, rays: Rays, centroid: Tensor) -> list[Tensor]:
         """By Optiland's variables radius, thickness and index; d/dc = -R² d/dR."""
+        self.prepare()
         optic, leaves, thicknesses = self._with_leaves
         z = torch.zeros((), dtype=self.dtype)
         for number in range(1, len(self.lens.surfaces)):
@@ -146,9 +149,13 @@ class Optiland(Tracer):
 
 
 class RayOptics(Tracer):
-    """ray-optics: one ray at a time, float64, forward. Raises ModuleNotFoundError if it is not installed."""
+    """ray-optics: one ray at a time, float64, forward. Raises ModuleNotFoundError if it is not installed.
+
+    most: rays that it traces in bearable time.
+    """
 
     name, most, dtype, has_gradient = "ray-optics", _RAY_OPTICS_MOST, torch.float64, False
+    with_path, device = True, "cpu"
 
     def __init__(self, lens: Lens):
         self.trace = importlib.import_module("rayoptics.raytr.raytrace").trace_raw
@@ -176,13 +183,13 @@ def set_threads(threads: int) -> None:
 
 
 def peers(lens: Lens) -> list[Tracer]:
-    """For `bench trace`: Optiland in float32 and float64 on torch, and on numpy."""
+    """For `bench_trace.py`: Optiland in float32 and float64 on torch, and on numpy."""
     by_torch = [Optiland(lens, dtype, backend="torch") for dtype in DTYPES]
     return [*by_torch, Optiland(lens, torch.float64, backend="numpy")]
 
 
 def rivals(lens: Lens, dtype: torch.dtype) -> list[Tracer]:
-    """For `bench speed`: Optiland on torch in this dtype, with gradients by indices, and on numpy in float64; and in
+    """For `bench_speed.py`: Optiland on torch in this dtype, with gradients by indices, and on numpy in float64; and in
     float64 ray-optics, for spheres if it is installed."""
     chosen = [Optiland(lens, dtype, backend="torch", by_indices=True), Optiland(lens, torch.float64, backend="numpy")]
     simple = all(surface.coefficients is None and surface.conic is None for surface in lens.surfaces)

@@ -1,13 +1,9 @@
 """Pages of results in Markdown: measurements are rewritten, text below the mark is kept."""
 
 import math
-import os
-import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-
-import torch
 
 from raytrace import files
 
@@ -77,26 +73,6 @@ def shown(value: float, digits: int) -> str:
 
 def measured(what: str, about: Mapping[str, str | int]) -> str:
     """A caption: the quantity measured, in one thread, and the machine."""
-    return f"Median processor time of {what}, one thread; " + ", ".join(f"{name} {one}" for name, one in about.items())
-
-
-def machine() -> dict[str, str | int]:
-    """The machine and the versions on which the measurements depend."""
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        "vector instructions": torch.backends.cpu.get_cpu_capability(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "torch threads": torch.get_num_threads(),
-    }
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
+    return f"Median processor time of {what}, one thread; " + ", ".join(
+        f"{name} {value}" for name, value in about.items()
+    )

@@ -1,45 +1,44 @@
-"""Speed of the trace and ratios to peers in one run: large and small batches, with gradient, aspheres, the sensor step.
+"""Speeds of the trace and ratios to peers, for `bench_speed.py`: batches, with gradient, aspheres, the sensor step.
 
 Every ratio is of medians of calls in turns, so that other load of the machine affects all alike.
 """
 
 import dataclasses
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
+from bench_kit import Request, clock_of, in_words
+from bench_reference import COLUMNS, errors_of
+from pages import listing
 from torch import Tensor
 
-from raytrace.bench.figures import speed_figure
 from raytrace.bench.measure import (
-    COLUMNS,
     DTYPES,
     SAMPLE,
-    Own,
     Row,
     Tracer,
     clock,
-    errors_of,
     field_rays,
     measured_rows,
     name_of,
     nothing,
     squared_radius,
+    variables,
     with_leaves,
 )
-from raytrace.bench.report import Measured, Request, clock_of, in_words
-from raytrace.cli.progress import progress
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
 from raytrace.maths.result import plain
 from raytrace.maths.sampling import sobol
-from raytrace.pages import listing, significant
 from raytrace.shards import torch_threads
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.prescription import lens as lens_of
 from raytrace.system.rays import Rays
-from raytrace.tracing.compiled import prepare
+from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.launch import rays_of_field
 from raytrace.tracing.scene import Memo, trace_bundle
@@ -86,10 +85,12 @@ class Bench:
         """
         copies, sample = max(1, min(count, _PIECE) // SAMPLE), field_rays(lens, SAMPLE)
         errors = {
-            tracer: errors_of(tracer, lens, sample, copies=copies if isinstance(tracer, Own) else 1, gradient=gradient)
+            tracer: errors_of(
+                tracer, lens, sample, copies=copies if isinstance(tracer, EngineTracer) else 1, gradient=gradient
+            )
             for tracer, _ in tasks
         }
-        graphs = lambda tracer: _LARGEST_GRAPH.get(prepare() if isinstance(tracer, Own) else "Optiland")  # noqa: E731
+        graphs = lambda tracer: _LARGEST_GRAPH.get(prepare() if isinstance(tracer, EngineTracer) else "Optiland")  # noqa: E731
         how = {"sizes": _PIECES, "graphs": graphs, "repeats": self.repeats, "threads": self.threads}
         rows = measured_rows([(tracer, work, errors[tracer]) for tracer, work in tasks], lens, count, **how)
         return [dataclasses.replace(row, dtype=name_of(self.dtype), what=what) for row in rows]
@@ -100,22 +101,6 @@ def benches_of(request: Request, sizes: Sizes) -> list[Bench]:
     lenses, peers, how = (double_gauss(), three_aspheres()), request.peers, (request.arguments.repeats, request.threads)
     rivals = {dtype: [peers.rivals(lens, dtype) for lens in lenses] if peers else [] for dtype in DTYPES}
     return [Bench(dtype, sizes, *how, *rivals[dtype]) for dtype in DTYPES]
-
-
-def bench(request: Request) -> Measured:
-    """All speeds and ratios."""
-    sizes = QUICK if request.arguments.quick else Sizes()
-    benches = benches_of(request, sizes)
-    with progress(len(STAGES) * len(benches), what="measuring") as bar:
-        rows, ratios = measure(benches, progress=bar.update)
-    about = {"machine": request.about(), "repeats": request.arguments.repeats, "sizes": dataclasses.asdict(sizes)}
-    names = {dtype: (lambda key, values=values: significant(values[key])) for dtype, values in ratios.items()}
-    lines = [
-        *("# Speed: this package and its peers", "", "    raytrace bench speed --docs docs", ""),
-        *listing({"ratio": lambda key: WORDS[key].format(**sizes_in_words(sizes))} | names, [*WORDS]),
-        *("", *speeds(rows, sizes, about["machine"], about["repeats"])),
-    ]
-    return Measured(rows, lines, document(rows, ratios) | about, speed_figure, ("speed.md", "speed"))
 
 
 def measure(benches: Sequence[Bench], *, progress: Callable[[int], object] = nothing) -> tuple[list, dict]:
@@ -139,7 +124,7 @@ def _forward(bench: Bench) -> tuple[list[Row], dict]:
     lens, sizes, rows = double_gauss(), bench.sizes, []
     tracers = [*_own(lens, bench.dtype), *bench.peers]
     for count in sorted({*sizes.counts, sizes.rays}):
-        chosen = [tracer for tracer in tracers if tracer.most is None or count <= tracer.most]
+        chosen = [tracer for tracer in tracers if count <= getattr(tracer, "most", math.inf)]
         rows += bench.rows("forward", lens, count, [(tracer, "forward") for tracer in chosen])
     last = [row for row in rows if row.rays == sizes.rays]
     return rows, {"forward_over_optiland": over(last, "Optiland"), "forward_s": last[0].seconds}
@@ -258,8 +243,42 @@ def three_aspheres() -> Lens:
     return lens_of(surfaces, stop=1, entrance_pupil_diameter=8.0, fields=[10.0], wavelengths=[0.55])
 
 
-def _own(lens: Lens, dtype: torch.dtype) -> list[Own]:
-    return [Own(lens, dtype, engine=engine, by_indices=True) for engine in ("auto", "eager")]
+class EngineTracer(Tracer):
+    """The trace of an engine, "auto" (the program's choice) or "eager", with derivatives also by the index of every
+    medium."""
+
+    def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str):
+        super().__init__(lens, dtype)
+        self.engine = engine
+        self.name = "raytrace" if engine == "auto" else f"raytrace, {engine}"
+        self.surfaces, self.indices, self.leaves = leaves_of(self.lens)
+
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        with trace_engine(self.engine):
+            return super().forward(rays)
+
+    def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]:
+        with trace_engine(self.engine):
+            return super().gradient(rays, centroid)
+
+
+def leaves_of(lens: Lens) -> tuple[tuple[Surface, ...], list[Tensor], list[Tensor]]:
+    """Surfaces after the object with the leaves of `variables`, the indices of all media, and the leaves: those of the
+    surfaces, then the indices. Neighbouring gaps of one medium share one."""
+    moving, leaves = with_leaves(lens, variables(lens))
+    fixed = media(lens, lens.primary)
+    indices = list(fixed)
+    for number, index in enumerate(fixed):
+        if number > 0 and index is fixed[number - 1]:
+            indices[number] = indices[number - 1]
+        else:
+            indices[number] = index.detach().clone().requires_grad_()
+            leaves.append(indices[number])
+    return moving.surfaces[1:], indices, leaves
+
+
+def _own(lens: Lens, dtype: torch.dtype) -> list[Tracer]:
+    return [EngineTracer(lens, dtype, engine=engine) for engine in ("auto", "eager")]
 
 
 def over(rows: Sequence[Row], name: str) -> float | None:

@@ -1,23 +1,29 @@
 """Speed of tolerancing: Cooke triplets perturbed and refocused in a second, and the same errors in Optiland.
 
+    python docs/experiments/bench_tolerance.py --threads 2 --docs FOLDER
+
+docs/tolerancing.md quotes the tables of tables.md.
 The lens is Optiland's Cooke triplet, of which its tutorial prints the focal length and the RMS spot radius while the
 first radius is moved. Every radius, thickness, decentre and tilt of a surface then has an error, and the sensor is put
 where the sum of the mean square spot radii is least: three fields, three wavelengths, each spot about its centroid.
 """
 
+import argparse
 import dataclasses
 import statistics
+import sys
 from collections.abc import Callable, Sequence
 
+import bench_kit as kit
 import torch
+from bench_kit import Page, Request, clock_of, in_words
+from pages import digits, listing, significant
 from torch import Tensor
 
 from raytrace.bench.measure import clock
-from raytrace.bench.report import Measured, Request, clock_of, in_words
 from raytrace.cli.progress import progress
 from raytrace.materials.catalogs import find_glass
 from raytrace.maths.sampling import gauss_rings, hexapolar
-from raytrace.pages import digits, listing, significant
 from raytrace.plotting.style import new_figure, styled
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.prescription import lens as lens_of
@@ -134,29 +140,30 @@ def sweep(lens: Lens, radii: Sequence[float]) -> list[tuple[float, float]]:
     return list(zip(first_order(lenses).effective_focal_length.flatten().tolist(), spots.tolist(), strict=True))
 
 
-def bench(request: Request) -> Measured:
+def bench(request: Request) -> Page:
     """Own and Optiland's trials in a second, and their differences."""
     repeats, lens = request.arguments.repeats, triplet()
-    own = {"hexapolar": study(lens, equal_rings(_RINGS)), "gauss": study(lens, gauss_rings(_RINGS, 6))}
+    studies = {"hexapolar": study(lens, equal_rings(_RINGS)), "gauss": study(lens, gauss_rings(_RINGS, 6))}
     rows, errors = [], draw_errors(tolerances(), TRIALS)
     with (
         progress(2 * repeats + (PEER_TRIALS + 1 if request.peers else 0), "call", what="measuring") as bar,
         torch.no_grad(),
     ):
-        for one in own.values():
-            seconds = _timed(lambda one=one: one.compensated(errors), request.threads, repeats, bar.update)
-            rows.append(Row("raytrace", _rays(one), errors.shape[1], TRIALS, TRIALS / seconds))
+        for each in studies.values():
+            seconds = _timed(lambda each=each: each.compensated(errors), request.threads, repeats, bar.update)
+            rows.append(Row("raytrace", _rays(each), errors.shape[1], TRIALS, TRIALS / seconds))
         if request.peers:
-            found, seconds = request.peers.tolerancing(
+            spots, seconds = request.peers.tolerancing(
                 tolerances(), errors[:PEER_TRIALS], _RINGS, bar.update, request.threads
             )
-            mine = own["hexapolar"].compensated(errors[:PEER_TRIALS])[0].sqrt()
-            off = float((torch.tensor(found) / mine - 1).abs().max())
+            mine = studies["hexapolar"].compensated(errors[:PEER_TRIALS])[0].sqrt()
+            off = float((torch.tensor(spots) / mine - 1).abs().max())
             speed = 1 / statistics.median(seconds)
             rows[0] = dataclasses.replace(rows[0], ratio=rows[0].speed / speed, difference=off)
             rows.append(Row("Optiland", rows[0].rays, errors.shape[1], PEER_TRIALS, speed, 1.0))
     about = {"repeats": repeats, "machine": request.about()}
-    return Measured(rows, report(rows, sweep(lens, [radius for radius, *_ in PUBLISHED]), **about), about, figure)
+    lines = report(rows, sweep(lens, [radius for radius, *_ in PUBLISHED]), **about)
+    return Page(rows, lines, about, figure, ("tables.md", "tolerancing"))
 
 
 def equal_rings(rings: int) -> tuple[Tensor, Tensor]:
@@ -165,8 +172,8 @@ def equal_rings(rings: int) -> tuple[Tensor, Tensor]:
     return points, torch.full_like(weights, 1 / len(weights))
 
 
-def _rays(one: Study) -> int:
-    return one.sampling.points.shape[1] * one.sampling.fields.shape[1] * len(one.lens.wavelengths)
+def _rays(study: Study) -> int:
+    return study.sampling.points.shape[1] * study.sampling.fields.shape[1] * len(study.lens.wavelengths)
 
 
 def _timed(call: Callable[[], object], threads: int, repeats: int, done: Callable[[], object]) -> float:
@@ -194,7 +201,7 @@ def report(rows: Sequence[Row], swept: Sequence[tuple[float, float]], *, repeats
         "",
         "The first radius moved, on the axis, as Optiland's tutorial prints it:",
         "",
-        *listing(SWEPT, [(*printed, *found) for printed, found in zip(PUBLISHED, swept, strict=True)]),
+        *listing(SWEPT, [(*printed, *computed) for printed, computed in zip(PUBLISHED, swept, strict=True)]),
         "",
         in_words(machine) + ".",
     ]
@@ -213,3 +220,15 @@ def figure(rows: Sequence[dict]):
     axes.set(xscale="log", xlabel="lenses perturbed and refocused in a second", xlim=(None, 4 * max(speeds)))
     axes.invert_yaxis()
     return made
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    kit.shared(parser, "tables.md, tolerancing.csv and tolerancing.png")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    kit.run(bench, options, argv, peers=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A textbook ray tracer in mpmath with 50 digits, one ray at a time: the reference of all others.
+"""A textbook ray tracer in mpmath with 50 digits, one ray at a time, and the errors of other tracers against it.
 
 It shares only the numbers of the lens with them: conics by the quadratic formula, aspheres by Newton's method,
 refraction by unit normals and cosines.
@@ -8,6 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mpmath import mp, mpf, sqrt
+from pages import digits, significant, yes
+
+from raytrace.bench.measure import Tracer, some, variables
+from raytrace.maths.numerics import to
+from raytrace.system.lens import Lens, media
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface, is_even
 
 _DIGITS = 50
 _STEP = "1e-25"  # of the differences that give gradients: good to about 25 digits
@@ -125,3 +132,76 @@ def spot_gradient(
             moved[number] = replace(moved[number], **{name: mpf(getattr(moved[number], name)) + step})
             gradient.append((merit(moved) - here) / step)
         return gradient
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+def shape_of(surface: Surface, number: int) -> tuple[float, float, list[float]]:
+    """Curvature, conic and coefficients of r², r⁴, …. Raises ValueError for other shapes."""
+    if not is_even(surface):
+        raise ValueError(f"surface {number} is no conic with even terms: peers and references cannot trace it")
+    c, k = (0.0 if value is None else float(value) for value in (surface.curvature, surface.conic))
+    return c, k, [] if surface.coefficients is None else surface.coefficients.tolist()
+
+
+def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
+    """The surfaces behind the object and the first index, for `trace_reference`."""
+    indices = [float(index) for index in media(lens, lens.primary)]
+    surfaces = [
+        ReferenceSurface(*shape_of(surface, number), float(surface.thickness), index, surface.is_mirror)
+        for number, (surface, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1)
+    ]
+    return surfaces, indices[0]
+
+
+def errors_of(
+    tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradient: bool = True
+) -> dict[str, float | None]:
+    """Errors of a tracer on a few rays (3, P) as in `raytrace.bench.measure.Row`; tracer and reference have the numbers
+    as rounded to the dtype.
+
+    copies: of the rays in the batch, so that the engine of large batches traces it; gradient: whether to compare that,
+    too.
+    """
+    lens, rays = to(lens, dtype=tracer.dtype), to(rays, dtype=tracer.dtype)
+    surfaces, index = reference_of(lens)
+    starts = list(zip(rays.position.T.tolist(), rays.direction.T.tolist(), strict=True))
+    exact, count = [trace_reference(surfaces, index, *start) for start in starts], len(starts)
+    batch = to(some(rays, lambda x: x.repeat(*(1,) * (x.dim() - 1), copies)), device=tracer.device)
+    points, path = tracer.forward(batch)
+    points = points[:, :count]
+    position = 1e6 * max(_worst(points[axis].tolist(), [ray.position[axis] for ray in exact]) for axis in (0, 1))
+    path_error = gradient_error = None
+    if path is not None:
+        relative = (path[:count].double() - path[0].double()).tolist()
+        path_error = 1e3 / float(lens.primary) * _worst(relative, [ray.path - exact[0].path for ray in exact])
+    if gradient and tracer.has_gradient:
+        names = variables(lens)
+        expected = spot_gradient(surfaces, index, starts, [(number - 1, name) for number, name in names])
+        slopes = [float(slope) for slope in tracer.gradient(batch, points.mean(1))]
+        gradient_error = 0.0
+        for kind in {name for _, name in names}:
+            pairs = [(a, b) for a, b, (_, name) in zip(slopes, expected, names, strict=False) if name == kind]
+            error = _worst(*zip(*pairs, strict=True)) / float(max(abs(b) for _, b in pairs))
+            gradient_error = max(gradient_error, error)
+    return {"position": position, "path_error": path_error, "gradient": gradient_error}
+
+
+def _worst(values: Sequence[float], expected: Sequence) -> float:
+    return max(float(abs(a - b)) for a, b in zip(values, expected, strict=True))
+
+
+#: Columns of the tables of rows.
+COLUMNS = {
+    "rays": lambda row: f"{row.rays:,}",
+    "what": lambda row: row.what,
+    "dtype": lambda row: row.dtype,
+    "tracer": lambda row: row.tracer,
+    "path": lambda row: yes(row.path),
+    "at a time": lambda row: f"{row.piece:,}",
+    "M/s": lambda row: significant(row.speed / 1e6),
+    "position error, nm": lambda row: digits(row.position, ".2g"),
+    "path error, waves": lambda row: digits(row.path_error, ".2g"),
+    "gradient error": lambda row: digits(row.gradient, ".2g") if row.what != "forward" else "",
+}

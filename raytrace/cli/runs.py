@@ -1,0 +1,132 @@
+"""Runs of commands that do more than call their function once."""
+
+import argparse
+import sys
+import warnings
+from pathlib import Path
+
+import raytrace
+from raytrace.cli.progress import Lines, progress, silence
+from raytrace.cli.run import (
+    CommandError,
+    catalogs,
+    find_lens,
+    open_lens,
+    options_of,
+    print_json,
+    printed_on_failure,
+    result_of_lens,
+    say,
+)
+from raytrace.io import read_lens, write_lens
+from raytrace.maths.result import Result
+from raytrace.shards import share
+from raytrace.system.lens import with_sensor_distance
+
+
+def glass(arguments: argparse.Namespace) -> Result:
+    """The data of a glass."""
+    return raytrace.glass(**options_of(arguments), catalogs=catalogs(arguments))
+
+
+def check(arguments: argparse.Namespace) -> Result:
+    """The import report of a file."""
+    return raytrace.check(find_lens(arguments.lens), **options_of(arguments), catalogs=catalogs(arguments))
+
+
+def convert(arguments: argparse.Namespace) -> Result:
+    """Write the file in another format."""
+    options = options_of(arguments) | {"source": find_lens(arguments.source)}
+    return raytrace.convert(**options, catalogs=catalogs(arguments))
+
+
+def layout(arguments: argparse.Namespace) -> Result:
+    """The layout, drawn in a file of this folder by default."""
+    arguments.plot = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"
+    return result_of_lens(arguments, raytrace.layout)
+
+
+def spot(arguments: argparse.Namespace) -> Result:
+    """The spots; --rays keeps no rays to plot or to write."""
+    for flag, path in (("--plot", arguments.plot), ("-o", arguments.output)):
+        if path and arguments.rays:
+            raise CommandError(f"{flag} needs the rays, and --rays keeps none: leave one out")
+    return result_of_lens(arguments, raytrace.spot)
+
+
+def focus(arguments: argparse.Namespace) -> Result:
+    """The focus; -o writes the lens of the file with the new sensor distance, without the conditions of the options."""
+    result = result_of_lens(arguments, raytrace.focus)
+    if arguments.output:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # shown when the file was first read
+            original = read_lens(
+                find_lens(arguments.lens),
+                catalogs=catalogs(arguments),
+                substitute=arguments.substitute,
+                configuration=arguments.configuration,
+            )
+        with printed_on_failure(result, arguments):
+            write_lens(with_sensor_distance(original, result.sensor_distance), arguments.output)
+        say(f"written: {arguments.output}")
+        arguments.output = None
+    return result
+
+
+def trace(arguments: argparse.Namespace) -> None:
+    """The table of rays, written as it is computed and not kept in memory."""
+    listing = result_of_lens(arguments, raytrace.trace)
+    if arguments.output:
+        with progress(listing.count, "ray", what="trace") as bar:
+            listing.save(arguments.output, bar.update)
+        if arguments.json:
+            print_json({"rays": listing.count, "output": arguments.output, "lost": listing.lost()})
+        else:
+            say(f"{listing.count} rays written to {arguments.output}")
+    elif arguments.json:
+        listing.write_json(sys.stdout.write)
+    else:
+        with Lines(listing.count, "ray", what="trace") as lines:  # no bar: the terminal may show the rays
+            listing.write(sys.stdout.write, lines.update)
+    for line in listing.failures():
+        say(line)
+
+
+def tolerance(arguments: argparse.Namespace) -> Result:
+    """The study; --save-trials writes lenses of its trials."""
+    folder = arguments.save_trials
+    if folder and arguments.trials == 0:
+        raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
+    result = result_of_lens(arguments, raytrace.tolerance)
+    if folder and not share().rank:
+        folder = f"{folder}{arguments.suffix}"
+        with printed_on_failure(result, arguments):
+            result.save_trials(folder, catalogs=catalogs(arguments))
+        say(f"written: typical.zmx, worst.zmx and best.zmx in {folder}")
+    return result
+
+
+def view(arguments: argparse.Namespace) -> None:
+    """The viewer until Ctrl-C."""
+    from raytrace.viewer.server import MissingExtra, serve  # loads the viewer
+
+    path = find_lens(arguments.lens)
+    silence()
+    file = path if Path(arguments.lens).exists() else Path(path.name)
+    port = arguments.port or 0
+    try:
+        serve(open_lens(arguments), file=file, port=port, browser=arguments.browser, as_json=arguments.json)
+    except MissingExtra as error:
+        raise CommandError(str(error)) from error
+
+
+def wave_psf(arguments: argparse.Namespace) -> Result:
+    """PSFs of an element, and figures of the element."""
+    options = options_of(arguments) | {"catalog": catalogs(arguments)}
+    psf = raytrace.wave_optics.wave_psf(**options)
+    for content in ("heights", "caustic", "encircled"):
+        if path := vars(arguments).pop(f"plot_{content}"):
+            with printed_on_failure(psf, arguments):
+                psf.plot(path, what=content, progress=options["progress"])
+            say(f"written: {path}")
+    return psf
