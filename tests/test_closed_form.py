@@ -7,7 +7,7 @@ from differences import gradcheck
 from raytrace.imaging.closed_form import patch_spectrum
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import dead_leaves
-from raytrace.imaging.restoration import depth_invariant_wiener, errors, errors_knowing
+from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, errors
 
 SIZE = 24
 
@@ -31,7 +31,7 @@ def test_error_is_that_of_drawn_pictures_and_noise(knows):
     white = torch.randn(2, 4000, SIZE, SIZE, generator=generator, dtype=torch.float64)
     picture = S.sqrt() * torch.fft.fft2(white[0])
     noise = sigma * torch.fft.fft2(white[1])
-    expected = errors_knowing(H, S, sigma) if knows else errors(H, S, sigma)
+    expected = depth_invariant_error(H[None], S, sigma) if knows else errors(H, S, sigma)
     for z in range(2):
         G = depth_invariant_wiener(H[z : z + 1] if knows else H, S, sigma)
         left = torch.fft.ifft2(G * (H[z] * picture + noise) - picture).real
@@ -53,11 +53,11 @@ def test_no_other_filter_does_better():
 def test_limits():
     S, H = falling_spectrum(), transfer_functions(gaussians(0.6, 2.0), SIZE)
     # One kernel: blind and knowing are the same; without blur σ²S/(S + σ²); with much noise nothing is restored.
-    torch.testing.assert_close(errors(H[:1], S, 0.1), errors_knowing(H[:1], S, 0.1), rtol=1e-12, atol=0)
+    torch.testing.assert_close(errors(H[:1], S, 0.1), depth_invariant_error(H[None, :1], S, 0.1), rtol=1e-12, atol=0)
     flat = torch.ones(1, SIZE, SIZE, dtype=torch.complex128)
     torch.testing.assert_close(errors(flat, S, 0.1)[0], (S * 0.01 / (S + 0.01)).mean(), rtol=1e-12, atol=0)
     torch.testing.assert_close(errors(H, S, 1e6), S.mean().expand(2), rtol=1e-6, atol=0)
-    assert bool((errors(H, S, 0.1) >= errors_knowing(H, S, 0.1)).all())
+    assert bool((errors(H, S, 0.1) >= depth_invariant_error(H[None], S, 0.1)).all())
 
 
 def test_transfer_function_of_a_symmetric_kernel_is_real_and_one_at_zero():

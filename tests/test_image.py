@@ -14,7 +14,6 @@ from raytrace.imaging.image import (
     add_noise,
     add_shot_noise,
     blur,
-    blur_adjoint,
     blur_layers,
     count_electrons,
     depth_masks,
@@ -101,24 +100,6 @@ def test_a_flat_picture_keeps_its_level_to_the_border():
     kernel = draws(7, 7)
     found = blur(torch.full((30, 30), 0.3, dtype=torch.float64), kernel / kernel.sum())
     torch.testing.assert_close(found, torch.full((24, 24), 0.3, dtype=torch.float64), atol=1e-15, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("boundary", "size", "origin"),
-    [(boundary, size, "pixel") for boundary in BOUNDARIES for size in ((5, 5), (4, 7))]
-    + [(boundary, (6, 4), "grid") for boundary in BOUNDARIES if boundary != "valid"],
-)
-def test_adjoint(boundary, size, origin):
-    """<B x, y> = <x, B* y>, by the adjoint and by autograd: to rounding."""
-    how = {"boundary": boundary, "origin": origin}
-    picture = draws(2, 16, 13).requires_grad_()
-    kernel = draws(2, *size, seed=1)
-    image = blur(picture, kernel, **how)
-    other = draws(*image.shape, seed=2)
-    (back,) = torch.autograd.grad(image, picture, other)
-    found = blur_adjoint(other, kernel, **how)
-    torch.testing.assert_close(found, back, atol=ROUNDING, rtol=0)
-    assert float((image * other).sum().detach()) == pytest.approx(float((picture * found).sum().detach()), rel=1e-13)
 
 
 @pytest.mark.parametrize("boundary", ["valid", "reflect"])

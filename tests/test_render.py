@@ -629,8 +629,22 @@ def test_a_lens_of_one_wavelength_has_no_colours(triplet):
     assert "all channels at the single wavelength of the lens, 0.55 µm" in text
 
 
+def test_rays_that_memory_does_not_hold_are_refused_where_no_gaussian_fits(triplet, monkeypatch):
+    """Without the kernels of a model before it, the error is that of the rays."""
+
+    def window(lens, sensor, model, *_, **__):
+        if model == "gaussian":
+            raise WindowTooLarge("the tails of a Gaussian")
+        raise OverBudget("the rays")
+
+    monkeypatch.setattr(render_module, "window_size", window)
+    sensor = rt.Sensor((36, 24), (1200, 800))
+    with pytest.raises(OverBudget, match="the rays"):
+        optics(triplet, sensor)
+
+
 def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
-    with within(1e8), pytest.raises(OverBudget, match=r"399 × 399 pixels .*3 × 3.*--tol.*--size"):
+    with within(1e8), pytest.raises(OverBudget, match=r"399 × 399 pixels .*3 × 3.*`tol`.*`size`"):
         optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
 
 

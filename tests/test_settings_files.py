@@ -41,6 +41,7 @@ def test_a_finished_run_gives_its_settings(tmp_path):
         ("epoch = 3", "'epoch' is no setting; did you mean epochs"),
         ('epochs = "three"', "epochs = 'three': expected int"),
         ("epochs = true", "epochs = True: expected int"),
+        ('step = "waves"', "step = 'waves': expected 'sag' or 'blur'"),
         ("epochs = 3 4", "no TOML"),
     ],
 )

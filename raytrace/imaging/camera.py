@@ -85,9 +85,9 @@ class Camera(nn.Module, Generic[V]):
     DRT(rays=points) take the rays of these pupil points, instead of as many as `tol` needs.
     object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field:
     places of images, which move with the image of the field point. By default those of the centre of the sensor, of 0.7
-    and of 1 of its half diagonal, which stay where they are on it; without a sensor the axis.
+    and of 1 of its half diagonal, whose images stay at these points of it; without a sensor the axis.
     pixels: of the sensor across the PSF window, an odd number, 21 by default.
-    center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): image position is no
+    center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): a displaced image is no
     error. normalise: "window" (PSFs of sum 1) or "energy" (of the share of the light through the entrance pupil);
     illumination: images have the relative illumination of their places, too.
     tol: allowed error of the kernels: the order of the PSF model is chosen once, for the lens at the first call
@@ -96,7 +96,7 @@ class Camera(nn.Module, Generic[V]):
     each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
-    its variables and the sensor, and loads into a camera of the same ones alone.
+    its variables and the sensor, and loads only into a camera with the same ones.
     Warns UnfilledStop once, for the lens at construction.
     """
 
@@ -154,7 +154,7 @@ class Camera(nn.Module, Generic[V]):
         self._memo = Memo(object_distances=object_distances)
 
     def _check_element(self) -> None:
-        """Refuse numbers of the other kind of camera. Raises ValueError, TypeError."""
+        """Refuse options of the other kind of camera, with a lens or without. Raises ValueError, TypeError."""
         is_alone = isinstance(self.variables, PhaseVariables)
         if self.element is not None and not isinstance(self.element, PhaseVariables):
             raise TypeError(f"Camera: `element` is {named_value(self.element)}; expected PhaseVariables(element)")
@@ -178,7 +178,7 @@ class Camera(nn.Module, Generic[V]):
         return () if element is None else element()
 
     def _check(self) -> None:
-        """Refuse what cannot be simulated. Raises ValueError, BadTolerance."""
+        """Refuse options that cannot be simulated. Raises ValueError, BadTolerance."""
         check_model(self.model, self.elements())
         for name, word, known in (
             ("center", self.center, ("chief", "centroid")),
@@ -209,15 +209,15 @@ class Camera(nn.Module, Generic[V]):
         return super()._apply(fn, recurse)
 
     def _fields_of_sensor(self, shares: Sequence[float] = (0.0, 0.7, 1.0)) -> Tensor:
-        """Field points (2, F) of shares of the way from the middle of the sensor to its corner, where there are any."""
+        """Field points (2, F) at shares of the half diagonal of the sensor; points without a chief ray are left out."""
         with torch.no_grad():
             fields = self.sensor.fields(self.lens(), self.sensor.on_diagonal(shares))
         return fields[:, ~fields.isnan().any(0)]
 
     def rates(self, *, optics: float, network: float, element: float | None = None) -> list[dict]:
-        """Groups of parameters for an optimiser of torch, with rates of their own: of the variables and the network.
+        """Parameter groups for an optimiser of torch: the variables and the network, each with its learning rate.
 
-        element: of the heights of an element at the stop, by default that of the variables.
+        element: learning rate of the heights of an element at the stop, by default that of the variables.
         """
         groups = [
             {"params": [*self.variables.parameters()], "lr": optics},
@@ -268,7 +268,7 @@ class Camera(nn.Module, Generic[V]):
         return self.size - 1
 
     def use(self, model: str | Model) -> None:
-        """Simulate with another PSF model, by its name or with its numbers."""
+        """Simulate with another PSF model, given by its name or with its parameters."""
         if isinstance(model, str):
             self.model, self.psf_parameters = model, None if model not in MODELS else model_of(model)
         else:
@@ -277,7 +277,7 @@ class Camera(nn.Module, Generic[V]):
         self._check()
 
     def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
-        """The lens with errors (N,), or a lens for each row of (L, N), its sensor focused again."""
+        """The lens with errors (N,), or a lens for each row of (L, N), refocused by its sensor distance."""
         if self.tolerances is None:
             raise ValueError("errors, but no tolerances: give Camera(…, tolerances=rt.tolerances(lens, grade=…))")
         return lens_as_built(self.variables(), self.tolerances, errors, self.fields)
@@ -310,9 +310,9 @@ class Camera(nn.Module, Generic[V]):
         """PSFs (B, C, rows, columns) of object distances (B,) mm, of the channels of the sensor.
 
         object_distances: a tensor, a sequence or one number. field: number of one of the camera's `fields`, or (B,)
-        numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N), of
-        the object points that the lens without errors images at these places. 0 where no light arrives, with the
-        warning DarkPlaces. Raises ValueError for points that are not finite.
+        numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N);
+        the object points are those that the nominal lens images at these places. PSFs are 0 where no light arrives,
+        with the warning DarkPlaces. Raises ValueError for points that are not finite.
         """
         distances, lens = self._distances(object_distances), self.lens()
         count = len(distances)

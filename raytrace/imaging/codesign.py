@@ -109,7 +109,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
 
 
 def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor | None:
-    """Pupil points (2, P): `count` of "sobol", or of the fewest whole rings of "hexapolar" with as many; or None."""
+    """Pupil points (2, P): `count` Sobol points, or hexapolar ones of the fewest rings with as many; None without."""
     if count is None:
         return None
     if sampling == "hexapolar":
@@ -132,7 +132,7 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | 
     )
 
 
-@functools.lru_cache(maxsize=8)  # every batch asks for it, and its response may be a file
+@functools.lru_cache(maxsize=8)  # every batch needs it, and its response may be read from a file
 def sensor_at_start(settings: CodesignSettings) -> Sensor:
     """The sensor of an experiment, of whole pixels; without a size a grey one of a patch, with white noise alone."""
     if not settings.sensor:
@@ -197,8 +197,8 @@ def with_catalog_glasses(
 ) -> tuple[Camera[Variables], CodesignSettings]:
     """The camera with the nearest glasses of the catalogs, and the settings to train it again for `relearn` epochs.
 
-    Its variables are the others, from their current numbers on; the network goes with it. Raises BadVariables where no
-    glass varies.
+    Its variables are all but the numbers of glasses, at their current values; its network is the trained one. Raises
+    BadVariables where no glass varies.
     """
     lens = trained.variables.snapped()
     words = [word for word in settings.vary.split() if word.partition(":")[0] not in GLASS]
@@ -240,7 +240,7 @@ class Batch:
     errors: Tensor | None = None
 
     def to(self, device: torch.device) -> Self:
-        """The same on a device; field, index and seed remain plain numbers."""
+        """The batch on a device; field, index and seed remain plain numbers."""
         if self.picture.device == device:
             return self
         names = ("picture", "distance", "errors", "points")
@@ -308,7 +308,7 @@ def light_of(levels: Tensor) -> Tensor:
 
 
 def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
-    """Raises ValueError if the pictures do not fill a batch."""
+    """The number of whole batches of an epoch. Raises ValueError if the pictures do not fill one."""
     if steps := len(pictures) * settings.crops // settings.batch:
         return steps
     raise ValueError(
@@ -430,9 +430,10 @@ def errors_as_built(
     *,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> tuple[Tensor, Tensor]:
-    """Mean |restored - picture| (C,) and PSNR (C,) dB of the mean square error, of perturbed cameras of no training.
+    """Mean |restored - picture| (C,) and PSNR (C,) dB of the mean square error, of perturbed cameras
+    that training never draws.
 
-    All cameras take the same test samples, a batch; they are the same lenses for all seeds and for any training.
+    All cameras record the same batch of test samples; their errors are the same for all seeds and trainings.
     progress: wraps the numbers of the cameras, for a bar.
     """
     count, pixels = len(pictures) * settings.crops, settings.patch**2
@@ -462,7 +463,7 @@ class Outcome:
     ("" if none is known). l1_as_built, psnr_as_built: of perturbed cameras after step 2, by their number, with DRT
     PSFs; empty without tolerances.
     Of a sensor: l1_by_place with DRT PSFs after step 2, by the share of the half diagonal at which all test patches
-    are; wiener_by_place: behind the depth-invariant Wiener filter of each place and channel instead of the network.
+    are; wiener_by_place: with the depth-invariant Wiener filter of each place and channel instead of the network.
     """
 
     model: str
@@ -501,9 +502,9 @@ def run_model(
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
-    folder: of this run, resumed if started; about: whatever else decides the result (lens file, pictures); progress:
-    wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the training. At the
-    end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
+    folder: of this run, resumed if started; about: other inputs that determine the result (lens file, pictures);
+    progress: wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the training.
+    At the end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
     """
     folder = Path(folder)
 
@@ -619,7 +620,7 @@ class Optimum:
     lens: Lens = dataclasses.field(kw_only=True)
 
     def document(self) -> dict:
-        """All but the lens."""
+        """The fields without the lens."""
         return {name: value for name, value in vars(self).items() if name != "lens"}
 
 

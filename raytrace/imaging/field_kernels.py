@@ -59,7 +59,7 @@ from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
 
 _SIGMAS = 4.2  # of a Gaussian that the window holds on each side: 1e-4 of the light of a round one is beyond
-#: λN that the window of diffraction is larger than the rays need, at least and at most. A circular pupil has
+#: Smallest and largest margin of the window for diffraction, in λN beyond the rays. A circular pupil has
 #: 2/(π² R) of its light farther away than R λN (Born & Wolf, Principles of Optics, §8.5.2).
 _RINGS = 6.0, 40.0
 _ALL_LIGHT = 6.0  # standard deviations beyond which a Gaussian is left out: 2e-9 of the light along a line
@@ -67,7 +67,7 @@ _LARGEST = 401  # pixels of a window
 _SMALLEST = 21  # pixels of a window of elements
 _TAIL = 1e-2  # of the light that a window 1.5 times as large adds
 _TOGETHER = 48  # fields of a call of `psf`
-_DISTANCES = 8  # of pairs of places and object distances, of a call of `psf`
+_DISTANCES = 8  # object distances of a call of `psf` for pairs of a place and a distance
 
 
 class WindowTooLarge(RaytraceError, ValueError):
@@ -115,7 +115,7 @@ class FieldKernels:
         return torch.cat([part._of_one_distance(points) for part in parts], 1)
 
     def paired(self, points: Tensor) -> Tensor:
-        """Kernels (N, C, size, size) at points (2, N) mm, each of its own of the object distances (N,)."""
+        """Kernels (N, C, size, size) of pairs: points (2, N) mm, each with its object distance of (N,)."""
         parts, order = [], []
         for group in self._groups():
             kernels = dataclasses.replace(self, object_distances=self.object_distances[group])
@@ -124,8 +124,8 @@ class FieldKernels:
         return torch.cat(parts)[torch.cat(order).argsort()]
 
     def of_pairs(self, fields: Tensor) -> Tensor:
-        """Kernels (N, C, size, size) of field points (2, N), each of its own of the object distances (N,), and of the
-        lenses of a batch of N."""
+        """Kernels (N, C, size, size) of field points (2, N), each with its object distance of (N,), and of a batch of N
+        lenses each with its lens."""
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             fields = torch.zeros_like(fields)
         finite = self.object_distances.detach().isfinite().to(fields)
@@ -141,7 +141,7 @@ class FieldKernels:
         return torch.cat(parts)[torch.cat(order).argsort()]
 
     def _groups(self) -> list[Tensor]:
-        """Numbers of the places whose kernels one call computes: all finite or all infinite distances."""
+        """Numbers of the places whose kernels one call computes: their distances are all finite or all infinite."""
         distances = self.object_distances.detach()
         if MODELS[self.model].traces and not self._has_radii:
             return [torch.nonzero(distances == distance)[:, 0] for distance in distances.unique()]
@@ -151,7 +151,7 @@ class FieldKernels:
         return [some for side in near_first for some in side.split(count)]
 
     def _paired(self, points: Tensor) -> Tensor:
-        """The same of a group."""
+        """`paired` of a group that one call computes."""
         distances, which = _distinct(self.object_distances)
         kernels = dataclasses.replace(self, object_distances=distances)
         if not MODELS[self.model].traces:
@@ -319,7 +319,7 @@ class FieldKernels:
         return shift, sagittal, tangential, known.to(radii)
 
     def origin(self, fields: Tensor) -> Tensor:
-        """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1 or W), see `origin`."""
+        """Points (2, D, N, 1 or W) mm where the chief rays of fields (2, N) meet the sensor: see `origin`."""
         if not varies(fields) and not bool(fields.any()) and is_round_about_axis(self.lens):
             return fields.new_zeros(2, len(self.object_distances), fields.shape[1], 1).expand(
                 -1, -1, -1, 1 if self.lateral_colour else len(self.lens.wavelengths)
@@ -370,17 +370,17 @@ class ElementKernels:
         return kernels.expand(points.shape[1], *kernels.shape)
 
     def paired(self, points: Tensor) -> Tensor:
-        """Kernels (N, C, size, size) at places (2, N) mm, each of its own of the object distances (N,)."""
+        """Kernels (N, C, size, size) of pairs: places (2, N) mm, each with its object distance of (N,)."""
         distances, which = _distinct(self.object_distances)
         return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
 
     def of_pairs(self, fields: Tensor) -> Tensor:
-        """The same of field points (2, N)."""
+        """`paired` of field points (2, N)."""
         return self.paired(fields)
 
 
 def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances without repetition, and each one's number among them; all of them where they vary."""
+    """Distinct distances and, of each distance, its number among them; all of them where they have derivatives."""
     if varies(distances):
         return distances, torch.arange(len(distances), device=distances.device)
     return distances.unique(return_inverse=True)
@@ -448,7 +448,8 @@ def check_model(model: str | None, elements: Sequence[Element]) -> None:
 def by_angle(lens: Lens) -> Lens:
     """The lens with angles in place of object heights: the image of an angle is the same at all object distances.
 
-    Unchanged with other fields, and telecentric in object space, where the image of a height is.
+    Lenses with other fields are unchanged, and lenses telecentric in object space, where the image of a height is the
+    same at all object distances.
     """
     if lens.fields.kind != "object_height" or lens.fields.telecentric:
         return lens
@@ -458,9 +459,10 @@ def by_angle(lens: Lens) -> Lens:
 
 
 def origin(lens: Lens, sensor: Sensor, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:
-    """Where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1), or without lateral colour (2, D, N, W).
+    """Points where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1), without lateral colour
+    (2, D, N, W).
 
-    They come from objects at distances (D,) mm and pass the centre of the pupil; vignetting factors are left out.
+    The rays come from objects at distances (D,) mm through the centre of the pupil; vignetting factors are left out.
     """
     lens = with_object_distance(lens, distances)
     return sensor.landing(lens, fields, lens.primary[None] if lateral_colour else lens.wavelengths)
@@ -605,8 +607,8 @@ def order_of(
 ) -> int:
     """The order of the model that meets the tolerance at field points (2, F); those that are nan do not count.
 
-    Of elements at the stop of a lens: the lowest order from which the next differs by less. Elements alone have none,
-    and pupil points among the parameters of the model have none.
+    With elements at the stop of a lens: the lowest order from which the next one differs by less. Elements alone, and
+    models of pupil points, have no orders: 0.
     """
     if not MODELS[model].traces and len(MODELS[model].orders) == 1:
         return MODELS[model].orders[0]

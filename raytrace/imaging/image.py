@@ -98,18 +98,6 @@ def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: st
     return torch.roll(blurred, (-(spot[0] // 2), -(spot[1] // 2)), (-2, -1))[..., : size[0], : size[1]]
 
 
-def blur_adjoint(image: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: str = "pixel") -> Tensor:
-    """The transpose of `blur`: ⟨blur(x), y⟩ = ⟨x, blur_adjoint(y)⟩: correlation, with extensions folded back.
-
-    image: (..., H, W) as returned by `blur` with this boundary; returns images, larger than `image` for "valid".
-    """
-    more = [n - 1 if boundary == "valid" else 0 for n in kernel.shape[-2:]]
-    batch = broadcast_shape(image.shape[:-2], kernel.shape[:-2])
-    picture = image.new_zeros(*batch, *(n + m for n, m in zip(image.shape[-2:], more, strict=True)))
-    transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)[1]
-    return transpose(image.expand(*batch, *image.shape[-2:]))[0]
-
-
 def visible(picture: Tensor, spot: Sequence[int]) -> Tensor:
     """The region (..., H - h + 1, W - w + 1) of images that a "valid" blur returns; spot: (h, w) of the kernels."""
     (rows, columns), (h, w) = picture.shape[-2:], spot

@@ -24,7 +24,7 @@ _CHUNK = 32  # radii whose pixels are computed at once
 
 
 class Octant:
-    """All that the heights of round elements do not change, for pictures of size × size pixels.
+    """The operators of round elements that do not depend on their heights, for pictures of size × size pixels.
 
     scene, plan: of the radial engine; later elements may have other heights, with steps at the same radii. dtype: of
     all sums; phases have that of the scene.

@@ -195,7 +195,7 @@ def binned(image: Tensor, count: int) -> Tensor:
 
 
 def _of_several(progress: Callable[[int, int], object], blurs: int) -> Callable[[int, int], None]:
-    """The progress of several blurs in turn: those to come are expected to take as many convolutions as the current."""
+    """The progress of several blurs in turn: each later one is expected to take as many convolutions as the current."""
     finished, left, current = 0, blurs, 0
 
     def advance(done: int, total: int) -> None:
@@ -221,7 +221,7 @@ def sampling_of(picture: Tensor, sensor: Sensor) -> int:
 
 
 def checked_picture(picture: Tensor, sensor: Sensor, sampling: int = 1) -> Tensor:
-    """Pictures (..., C, H, W) of the channels of the sensor, sampled so finely. Raises ValueError for others."""
+    """Pictures (..., C, H, W) of the channels of the sensor and of its sampled size. Raises ValueError for others."""
     picture = as_picture(picture)
     channels = len(sensor.channels)
     picture = picture[None] if picture.dim() == 2 else picture
@@ -696,7 +696,7 @@ def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tenso
 
 
 def _pooled(kernels: Tensor, factor: int) -> Tensor:
-    """Kernels (..., h, w) on pixels so many times larger, an odd number, whose middle stays in the middle."""
+    """Kernels (..., h, w) on pixels larger by an odd factor, about the same middle."""
     if factor == 1:
         return kernels
     size = [2 * math.ceil((n - factor) / 2 / factor) + 1 for n in kernels.shape[-2:]]
@@ -766,7 +766,8 @@ def _ideal(
 
 
 def _paraxial_image(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
-    """Paraxial images (2, N) mm of the objects whose chief rays meet the sensor at (2, N) mm; there itself if none."""
+    """Paraxial images (2, N) mm of the objects whose chief rays meet the sensor at points (2, N) mm; where no chief ray
+    arrives, the point itself."""
     near = 1e-4 * points.abs().max() * torch.eye(2, dtype=points.dtype, device=points.device)
     fields = sensor.fields(lens, torch.cat([points, near], 1))
     extents = object_field(lens, fields.nan_to_num(0.0), axial_beam(lens))[0]
@@ -1025,14 +1026,14 @@ class Rendering(Result):
         return dataclasses.replace(self, image=image, picture=binned(light, ready.sampling))
 
     def recorded(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """With the noise, the quantisation and the Bayer mosaic (..., 1, H, W) of the sensor: raw.
+        """The raw rendering (..., 1, H, W): with the noise, the quantisation and the Bayer mosaic of the sensor.
 
         index, seed: of the noise, see `Sensor.capture`.
         """
         return dataclasses.replace(self, image=self.optics.sensor.capture(self.image, index, seed))
 
     def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """As `recorded`, the missing colours of the mosaic interpolated."""
+        """The rendering as `recorded`, with the missing colours of the mosaic interpolated."""
         recorded = self.recorded(index, seed)
         return dataclasses.replace(recorded, image=self.optics.sensor.demosaic(recorded.image))
 

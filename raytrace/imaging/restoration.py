@@ -114,11 +114,6 @@ def _half_transfer(kernels: Tensor, spectrum: Tensor) -> tuple[Tensor, Tensor]:
     return torch.fft.rfft2(kernels, s=(rows, columns)), weight
 
 
-def errors_knowing(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-    """Mean square error (Z, ...) if the transfer function is known: the minimum over linear filters."""
-    return depth_invariant_error(transfer[None], spectrum, sigma)
-
-
 # -- joint filters of several channels
 
 

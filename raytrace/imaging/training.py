@@ -40,7 +40,7 @@ class NotFinite(RaytraceError, ArithmeticError, ValueError):
 
 
 class OtherSettings(RaytraceError, ValueError):
-    """A run is resumed with settings other than its own."""
+    """A run is resumed with settings other than those that it was started with."""
 
 
 class DamagedRun(RaytraceError, ValueError):
@@ -105,8 +105,8 @@ def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.opti
 class Run(Folder):
     """A folder of a training run.
 
-    settings: whatever decides the result, as JSON; a folder with others is refused with OtherSettings. usual: defaults
-    of settings that an older folder does not have.
+    settings: all inputs that determine the result, as JSON; a folder with others is refused with OtherSettings. usual:
+    defaults of settings that an older folder does not have.
     """
 
     def __init__(self, folder: str | Path, settings: Mapping, *, usual: Mapping = MappingProxyType({})):

@@ -393,7 +393,7 @@ class Variables(Owned):
 
     @functools.cached_property
     def _free(self) -> DesignVariables:
-        """The variables that are parameters, and the solve of the focal length."""
+        """The variables that are parameters, and the solve for the focal length."""
         if self.held is None:
             return self.design
         solve = Solve(*self.held.by.address, "focal_length", (self.held.focal_length,))
@@ -452,7 +452,7 @@ class Variables(Owned):
         return {name: numbers[name] for name in self.names}
 
     def beyond(self) -> str:
-        """Why the solved number is beyond its bounds; "" where it is not."""
+        """A solved number beyond its bounds, as a text for an error; "" within them."""
         if self.held is None:
             return ""
         value, (low, high) = self.numbers()[self.held.by.name], self._range(self.held)
@@ -496,7 +496,7 @@ class Variables(Owned):
         self._before = self._values()
 
     def __getstate__(self) -> dict:
-        """All but the prepared conditions, which a copy prepares again."""
+        """The state without the prepared conditions, which a copy prepares again."""
         return {name: part for name, part in vars(self).items() if name not in ("_constraints", "_glasses")}
 
     def _conditions(self) -> tuple[Condition, ...]:
@@ -549,8 +549,8 @@ class Variables(Owned):
         return with_glasses(self(), self._glasses.nearest(self._values()))
 
     def _excess(self, x: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        """By how much thicknesses, mm, and the solved number, in its unit, are beyond their limits (K,), at numbers
-        x (n,), and the derivatives (K, n)."""
+        """Excess (K,) of thicknesses, mm, and of the solved number, in its unit, over their limits at numbers x (n,),
+        and its derivatives (K, n)."""
         numbers = torch.tensor(x)
         with torch.set_grad_enabled(derivatives):
             numbers = with_tangents(numbers, torch.eye(len(x), dtype=numbers.dtype)) if derivatives else numbers
@@ -569,7 +569,7 @@ class Variables(Owned):
         return sum((e.clamp_min(0).square() for e in self._solved_beyond(lens)), violation(lens, self.limits))
 
     def _solved_beyond(self, lens: Lens) -> list[Tensor]:
-        """By how much the solved number of a lens is beyond each of its bounds, in its unit."""
+        """Excess of the solved number of a lens over each of its bounds, in its unit."""
         if self.held is None:
             return []
         number, unit = self.held.number(lens), abs(self.held.by.unit)
@@ -579,7 +579,7 @@ class Variables(Owned):
 
 def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
     """The variables, solves and pickups of variable syntax, without solves of the file, in double precision on the
-    processor. Raises BadVariables for what a camera does not vary."""
+    processor. Raises BadVariables for numbers that a camera does not vary."""
     if not split_words(vary):
         raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
     lens, data = to(lens, dtype=torch.float64, device="cpu"), lens.optimization_data
@@ -594,8 +594,8 @@ def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
 
 
 def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Variable, ...]:
-    """The variables of a design; the last thickness has the name of the word that names it last. Raises BadVariables
-    where one changes nothing."""
+    """The variables of a design; the last thickness is called "sensor" where the last word for it is. Raises
+    BadVariables for a variable that changes nothing."""
     lens, last = design.lens, sensor(design.lens)
     naming = [word for word in split_words(vary) if "=" not in word and Vary(last, "thickness") in varied(lens, word)]
     names = [name_of(number) for number in design.variables]
@@ -606,7 +606,7 @@ def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Vari
 
 
 def _unit(lens: Lens, number: Vary, start: float) -> float:
-    """The unit of a variable of a lens in which it is modelled. Raises BadVariables where it changes nothing.
+    """The unit of a variable of a lens in which it is modelled. Raises BadVariables where the image does not change.
 
     Units of numbers of the shape follow from the first term of the series z ≈ c r²/2 + (1 + k) c³ r⁴/8 + … at the
     semi-diameter, or at the radius of the entrance pupil where the surface has none.

@@ -236,7 +236,7 @@ def quality(
     test: Tensor,
     psf: ElementPsf | None = None,
 ) -> Quality:
-    """Of test pictures (B, N, N), expected over noise, behind filters for training pictures (A, N, N) alone.
+    """Image quality of test pictures (B, N, N), expected over noise, with filters for training pictures (A, N, N).
 
     psf: `kernels` of the elements, if they are known.
     """

@@ -222,7 +222,7 @@ def begin(
 ) -> tuple[WaveCamera, Run]:
     """The camera at the start of a run, and its folder, where the initial element is stored.
 
-    pictures: `digest` of the training pictures, whose spectrum is given.
+    pictures: `digest` of the training pictures of the spectrum.
     Raises training.OtherSettings if the folder was started with others.
     """
     run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(config), "pictures": pictures})
