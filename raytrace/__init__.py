@@ -94,13 +94,13 @@ PUBLIC = {
     "AsBuilt": "tolerancing.as_built",
     "Compensator": "system.tolerance_data",
     "Tolerance": "system.tolerance_data",
-    "Tolerances": "tolerancing.table",
+    "ToleranceTable": "tolerancing.table",
     "cemented_groups": "tolerancing.elements",
     "draw_errors": "tolerancing.sampling",
     "lens_elements": "tolerancing.elements",
     "perturbed": "tolerancing.perturbation",
     "read_tolerances": "tolerancing.files",
-    "Toleranced": "tolerancing.analysis",
+    "ToleranceAnalysis": "tolerancing.analysis",
     "tolerance": "tolerancing.analysis",
     "tolerances": "tolerancing.grades",
     # images and analyses
@@ -286,7 +286,10 @@ NAMESPACES = (
     *("imaging", "wave_optics"),
 )
 #: Names of older versions that changed, and their names now.
-RENAMED = {"element": "phase_element", "elements": "phase_elements"}
+RENAMED = {
+    **{"element": "phase_element", "elements": "phase_elements"},
+    **{"Tolerances": "ToleranceTable", "Toleranced": "ToleranceAnalysis"},
+}
 
 __all__ = [*TOP, *NAMESPACES]
 

@@ -206,7 +206,7 @@ def test_spot_of_tolerances(lens):
     """The nominal lens of a tolerance analysis without compensators has the spots of `rt.spot`: of the rings that 1e-4
     takes behind a vane, whose spot of 12 rings is 1.6e-4 off."""
     rows = [rt.system.Tolerance("surface_tilt_x", (len(lens.surfaces) - 2,), -1e-3, 1e-3)]
-    nominal = rt.tolerance(lens, rt.tolerancing.Tolerances(tuple(rows)), trials=0).nominal
+    nominal = rt.tolerance(lens, rt.tolerancing.ToleranceTable(tuple(rows)), trials=0).nominal
     squares = rt.spot(lens, rings=24).whole.mean_square_radius
     weights = lens.fields.weight / lens.fields.weight.sum()
     expected = float((weights * squares).sum().sqrt()) / MICROMETRE
@@ -236,14 +236,14 @@ def test_wavefront_of_tolerances(lens):
     assert close(nominal, expected, rel=5e-3, abs=1e-6)
 
 
-def clipped_and_moved(name: str) -> tuple[Lens, rt.tolerancing.Tolerances]:
+def clipped_and_moved(name: str) -> tuple[Lens, rt.tolerancing.ToleranceTable]:
     """A lens of one wavelength, and the decentre of the surface that clips its beams."""
     lens = member(name)
     lens = lens.at(wavelengths=lens.primary[None], fields=own_fields(lens)[:, -1:])
     surface = next(k for k, surface in enumerate(lens.surfaces) if surface.apertures)
     size = 0.02 * max(lens.surfaces[surface].apertures[0].extent)
     row = rt.system.Tolerance("surface_decenter_y", (surface,), -size, size)
-    return lens, rt.tolerancing.Tolerances((row,))
+    return lens, rt.tolerancing.ToleranceTable((row,))
 
 
 @quiet
@@ -270,7 +270,7 @@ def test_errors_that_clip_a_beam():
     """A rim that clips nothing of the nominal lens clips the beam of a lens in which it is decentred."""
     lens = rt.focus(_with_aperture(rt.system.Aperture("circular", (0.0, 4.05)))).lens
     rows, errors = (
-        rt.tolerancing.Tolerances((rt.system.Tolerance("surface_decenter_y", (1,), -0.3, 0.3),)),
+        rt.tolerancing.ToleranceTable((rt.system.Tolerance("surface_decenter_y", (1,), -0.3, 0.3),)),
         torch.tensor([[0.0], [0.3]]),
     )
     sampling = sampling_of(lens)
@@ -325,7 +325,7 @@ def test_angles_behind_an_afocal_lens():
     lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10.0, fields=[0, 1], **SINGLE)
     lens = dataclasses.replace(lens, afocal=True)
     tilt = rt.system.Tolerance("surface_tilt_x", (2,), -1e-3, 1e-3)
-    nominal = rt.tolerance(lens, rt.tolerancing.Tolerances((tilt,)), trials=0).nominal
+    nominal = rt.tolerance(lens, rt.tolerancing.ToleranceTable((tilt,)), trials=0).nominal
     merit = rt.evaluate(lens, merit=rt.optimization.DefaultMerit("angular", rings=8, arms=24)).merit
     assert 1e-3 * float(nominal) == pytest.approx(float(merit), rel=2e-4)  # q of the criterion to 1e-4
 
@@ -508,7 +508,7 @@ def test_focus_as_built(name):
     lens = member(name).at(fields=[0, 2])
     sensor = len(lens.surfaces) - 2
     rows = [rt.system.Tolerance(kind, (k,), -0.3, 0.3) for kind, k in (("surface_tilt_x", 2), ("thickness", sensor))]
-    rows = rt.tolerancing.Tolerances(tuple(rows), (rt.system.Compensator(sensor),))
+    rows = rt.tolerancing.ToleranceTable(tuple(rows), (rt.system.Compensator(sensor),))
     errors = torch.tensor([[0.2, 0.03], [-0.3, -0.05]], dtype=torch.float64)
 
     def shift(lens: Lens) -> torch.Tensor:

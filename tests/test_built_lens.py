@@ -261,3 +261,27 @@ def test_wrong_cameras_as_built_are_refused(lens):
         built.kernels(DISTANCES[:2], 0, errors)
     with pytest.raises(ValueError, match="refocus 'gap': expected sensor or none"):
         camera(lens, dataclasses.replace(BUILT, refocus="gap"))
+
+
+def test_a_sensor_in_colour_takes_lenses_as_built(lens):
+    """Kernels of each channel at a place are those of the perturbed lens at the field point that the nominal one images
+    there, about its own chief ray."""
+    lens = lens.at(wavelengths=(0.48, 0.53, 0.62), ray_aiming="real")
+    sensor = rt.Sensor((24, 16), (2400, 1600), response="rgb")
+    tolerances = rt.tolerances(lens, grade="precision", compensators=())
+    built = rt.Camera(
+        rt.Variables(lens, "sensor"), torch.nn.Identity(), sensor=sensor, tolerances=tolerances, pixels=7,
+        model=rt.psf_models.Gaussian(order=4),
+    )  # fmt: skip
+    points = torch.tensor([[0.0, 6.0], [3.0, -4.0]], dtype=torch.float64)
+    errors = rt.tolerancing.draw_errors(tolerances, 2, seed=1)
+    with torch.no_grad():
+        kernels = built.kernels(DISTANCES[:2], errors=errors, points=points)
+        fields, weights = sensor.fields(lens, points), sensor.weights(lens.wavelengths)
+        for k in range(2):
+            perturbed = rt.tolerancing.perturbed(lens, tolerances, errors[k])
+            about = {"fields": fields[:, [k]], "object_distances": DISTANCES[k : k + 1], "per_wavelength": True}
+            colours = rt.psf(perturbed, rt.psf_models.Gaussian(order=4), **about, pixel=0.01, size=7).kernel[0, 0]
+            wanted = torch.einsum("cw,wij->cij", weights, colours).flip(-1)
+            wanted = wanted / wanted.sum((1, 2), keepdim=True)
+            assert float((kernels[k] - wanted).abs().sum((1, 2)).max()) < 1e-9

@@ -248,7 +248,7 @@ def test_boresight_has_exact_derivatives(triplet):
 
 
 def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
-    whole = rt.tolerancing.Tolerances((rt.system.Tolerance("element_decenter_y", (1, 7), -0.03, 0.03),))
+    whole = rt.tolerancing.ToleranceTable((rt.system.Tolerance("element_decenter_y", (1, 7), -0.03, 0.03),))
     found = rt.tolerance(triplet, whole, criterion="boresight", trials=0)
     assert float(found.maximum[0]) == pytest.approx(30.0, abs=0.1)
     assert float(found.slope[0]) == pytest.approx(float(found.maximum[0]), rel=1e-5)
@@ -260,7 +260,7 @@ def test_boresight_of_a_decentred_lens_is_its_decentre(triplet):
 @pytest.mark.parametrize("criterion", ["rms", "wavefront", "boresight"])
 def test_surfaces_that_cross_are_traced_as_they_stand(triplet, criterion):
     """A gap of 2 mm with an error of -3 mm: rays go back by 1 mm, as in OpticStudio."""
-    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (4,), -3.0, 3.0, adjust=6),))
+    rows = rt.tolerancing.ToleranceTable((rt.system.Tolerance("thickness", (4,), -3.0, 3.0, adjust=6),))
     found = rt.tolerance(triplet, rows, criterion=criterion, trials=0)
     crossed = triplet.replace(4, thickness=-1.0).replace(6, thickness=float(triplet.surfaces[6].thickness) + 3.0)
     alone = rt.tolerance(crossed, rows, criterion=criterion, trials=0)

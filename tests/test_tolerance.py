@@ -317,7 +317,7 @@ def test_a_killed_study_loses_nothing(triplet, tmp_path):
 def test_trials_without_light_are_counted_by_every_criterion():
     """A decentre of ±30 mm: some lenses let no light of a field through; they have neither spot nor wavefront."""
     lens = rt.read_lens("cooke_triplet").at(fields=[0, 11.9], ray_aiming="off")
-    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("element_decenter_y", (1, 2), -30.0, 30.0),))
+    rows = rt.tolerancing.ToleranceTable((rt.system.Tolerance("element_decenter_y", (1, 2), -30.0, 30.0),))
     dark = [
         rt.tolerance(lens, rows, criterion=name, trials=24, seed=1, rings=2).trials.isnan()
         for name in ("rms", "wavefront")
@@ -364,7 +364,7 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
         stop=1, entrance_pupil_diameter=10.0, fields=(0.0,), wavelengths=(0.5876,),
     )  # fmt: skip
     lens = lens.replace(1, apertures=(rt.system.Aperture("circular", (0.0, 6.0)),))
-    rows = rt.tolerancing.Tolerances(
+    rows = rt.tolerancing.ToleranceTable(
         (rt.system.Tolerance("surface_decenter_x", (1,), -4.0, 4.0), rt.system.Tolerance("thickness", (2,), -1, 1))
     )
     d, R, r = 4.0, 6.0, 5.0
@@ -390,7 +390,7 @@ def test_light_that_a_lens_loses_is_counted_and_bounded():
 def test_all_configurations_are_judged():
     lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
     rows = [rt.system.Tolerance("operand", (), -0.1, 0.1, configuration=k + 1, operand=0) for k in range(2)]
-    rows = rt.tolerancing.Tolerances((*rows, rt.system.Tolerance("thickness", (1,), -0.05, 0.05)))
+    rows = rt.tolerancing.ToleranceTable((*rows, rt.system.Tolerance("thickness", (1,), -0.05, 0.05)))
     found = rt.tolerance(lens, rows, trials=0)
     assert found.configurations == 2
     assert float(found.maximum.abs().min()) > 1e-4
@@ -399,7 +399,7 @@ def test_all_configurations_are_judged():
         for each in lens.configurations:
             alone = rt.tolerance(
                 dataclasses.replace(rt.tolerancing.perturbed(each, rows, errors), operands=()),
-                rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (1,), -1e-9, 1e-9),)), trials=0,
+                rt.tolerancing.ToleranceTable((rt.system.Tolerance("thickness", (1,), -1e-9, 1e-9),)), trials=0,
             )  # fmt: skip
             squares.append(float(alone.nominal) ** 2)
         k = int(errors.argmax())
@@ -409,7 +409,7 @@ def test_all_configurations_are_judged():
 def test_configurations_count_by_their_weights():
     """CWGT 1 and 3: q is the mean by weight; of weights 0 and 1 that of the second one alone; of 0 and 0 the mean."""
     lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
-    rows = rt.tolerancing.Tolerances((rt.system.Tolerance("thickness", (3,), -0.05, 0.05),))
+    rows = rt.tolerancing.ToleranceTable((rt.system.Tolerance("thickness", (3,), -0.05, 0.05),))
 
     def square(weights):
         weight = Operand("CWGT", numbers=torch.tensor(weights, dtype=torch.float64))
@@ -433,8 +433,8 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
     place = next(k for k, operand in enumerate(lens.operands) if operand.number == 7)
     rows = rt.system.Tolerance("thickness", (1,), -0.05, 0.05)
     both = tuple(rt.system.Compensator(7, configuration=k + 1, operand=place) for k in range(2))
-    found = rt.tolerance(lens, rt.tolerancing.Tolerances((rows,), both), trials=4, rings=6)
-    single = rt.tolerancing.Tolerances((rows,), (rt.system.Compensator(7),))
+    found = rt.tolerance(lens, rt.tolerancing.ToleranceTable((rows,), both), trials=4, rings=6)
+    single = rt.tolerancing.ToleranceTable((rows,), (rt.system.Compensator(7),))
     lenses = [dataclasses.replace(each, operands=()) for each in lens.configurations]
     alone = [rt.tolerance(each, single, trials=4, rings=6) for each in lenses]
     expected = math.hypot(*(float(each.nominal) for each in alone)) / 2**0.5
@@ -444,7 +444,7 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
     with pytest.raises(rt.BadTolerance, match="2 operands in configurations 1 to 2"):
         rt.tolerance(
             lens,
-            rt.tolerancing.Tolerances((rows,), (rt.system.Compensator(7, configuration=3, operand=place),)),
+            rt.tolerancing.ToleranceTable((rows,), (rt.system.Compensator(7, configuration=3, operand=place),)),
             trials=0,
         )
 
@@ -479,7 +479,7 @@ def test_a_compensator_listed_twice_is_refused(triplet):
 @pytest.mark.parametrize("decentre", [30.0, 60.0])
 def test_trials_without_light_leave_the_figures_of_the_others(triplet, decentre, tmp_path):
     lens = triplet.at(fields=[0, 8.4])
-    rows = rt.tolerancing.Tolerances(
+    rows = rt.tolerancing.ToleranceTable(
         (rt.system.Tolerance("element_decenter_y", (3, 4), -decentre, decentre, distribution="end_points"),
          rt.system.Tolerance("element_decenter_y", (1, 2), -0.1, 0.1)),
         (rt.system.Compensator(7),),

@@ -323,7 +323,7 @@ def test_what_no_error_touches_stays_the_same(nominal):
 def test_a_fringe_of_power_is_half_a_wave_of_sag_at_the_semi_diameter(nominal):
     lens = nominal.replace(1, conic=-0.7)
     found = rt.tolerancing.perturbed(
-        lens, rt.tolerancing.Tolerances((T("power", (1,), -9, 9),), test_wavelength=0.5), [3.0]
+        lens, rt.tolerancing.ToleranceTable((T("power", (1,), -9, 9),), test_wavelength=0.5), [3.0]
     )
     h = number(8.0)
     old, new = (sag_at(one.surfaces[1], 0 * h, h) for one in (lens, found))
@@ -378,7 +378,7 @@ def test_the_change_by_a_wedge_is_that_of_a_decentred_sphere():
     step = radius * math.sin(math.radians(0.1))
     rows.append(T("element_decenter_y", (1, 1), -step, step))
     rows, rays = (
-        rt.tolerancing.Tolerances(tuple(rows), (rt.system.Compensator(11),)),
+        rt.tolerancing.ToleranceTable(tuple(rows), (rt.system.Compensator(11),)),
         {"fields": [0, 10, 14, -10, -14], "rings": 4, "arms": 6},
     )
     tilt, element, decentre = rt.tolerance(lens, rows, trials=0, **rays).maximum

@@ -42,7 +42,7 @@ def seconds_of_expectation(lens: rt.Lens, grade: str, criterion: str) -> float:
     return seconds
 
 
-def timed(**options) -> tuple[rt.tolerancing.Toleranced, float]:
+def timed(**options) -> tuple[rt.tolerancing.ToleranceAnalysis, float]:
     """A study and its processor time in s."""
     start = time.process_time()
     found = rt.tolerance(**options)

@@ -1,4 +1,4 @@
-from raytrace.tolerancing.analysis import Toleranced as Toleranced
+from raytrace.tolerancing.analysis import ToleranceAnalysis as ToleranceAnalysis
 from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
 from raytrace.tolerancing.elements import cemented_groups as cemented_groups
@@ -9,4 +9,4 @@ from raytrace.tolerancing.jacobian import Jacobian as Jacobian
 from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.perturbation import perturbed as perturbed
 from raytrace.tolerancing.sampling import draw_errors as draw_errors
-from raytrace.tolerancing.table import Tolerances as Tolerances
+from raytrace.tolerancing.table import ToleranceTable as ToleranceTable

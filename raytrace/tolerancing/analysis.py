@@ -504,7 +504,6 @@ def tolerance_analysis(
 
 
 #: Former names.
-Toleranced = ToleranceAnalysis
 tolerance = tolerance_analysis
 
 

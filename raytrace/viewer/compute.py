@@ -7,7 +7,7 @@ the warnings of the analyses, `remarks`.
 import dataclasses
 import math
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -116,7 +116,7 @@ class Drawing:
 def layout_of(lens: Lens, fields: Tensor) -> dict:
     """The cross section with the rays of fields (2, F). Raises ValueError for a lens that cannot be drawn."""
     drawing = Drawing()
-    draw_layout(drawing, lens, fields=fields, rays=RAYS)
+    draw_layout(cast(style.Axes, drawing), lens, fields=fields, rays=RAYS)  # a drawing has the methods that it calls
     return drawing.document()
 
 
@@ -274,14 +274,14 @@ def prescription(state: State) -> dict:
             numbers |= {name: number_at(surface, path) for name, path in paths}
         if surface.is_break:
             numbers = {name: value for name, value in numbers.items() if name not in ("curvature", "conic")}
-        numbers = {name: 0.0 if value is None else float(value) for name, value in numbers.items()}
+        values = {name: 0.0 if number is None else float(number) for name, number in numbers.items()}
         here = [{word.split(":")[0] for word in words if word.endswith(f":{k}")} for words in (state.vary, follows)]
         rows.append(
             {
                 "surface": k,
-                "cells": {name: plain(value) for name, value in numbers.items()},
+                "cells": {name: plain(value) for name, value in values.items()},
                 "sliders": {
-                    name: slider_ends(lens, k, name, value) for name, value in numbers.items() if math.isfinite(value)
+                    name: slider_ends(lens, k, name, value) for name, value in values.items() if math.isfinite(value)
                 },
                 "glass": None if k == last or surface.is_break else label(surface.glass),
                 "semi_diameter": surface.semi_diameter,
