@@ -167,7 +167,7 @@ def test_a_run_as_built_resumes_and_lists_its_perturbed_cameras(run, pictures, m
         assert Path(f"parts/{name}").read_bytes() == Path(f"whole/{name}").read_bytes()
     found = read("whole/outcome.json")
     assert [*found["l1_as_built"]] == [*found["psnr_as_built"]] == ["1", "2"]
-    assert "2 perturbed cameras of no training, mean ± standard deviation (trained as built):" in text
+    assert "2 perturbed cameras that training never draws, mean ± standard deviation (trained as built):" in text
     assert f"{sum(found['l1_as_built'].values()) / 2:.5f} ± " in text
     code, _, err = run(*command[:-1], "-o", "parts")
     assert code == 1

@@ -81,7 +81,7 @@ def open_experiment(
 ) -> Experiment:
     """Open the lens, refuse what cannot be simulated, then read the pictures.
 
-    pictures: digest of those of a finished run, which are read no more.
+    pictures: digest of the pictures of a finished run, which are not read again.
     """
     path, lens = find_lens(arguments.lens), _file_lens(arguments)
     if settings.near >= settings.far:
@@ -360,7 +360,7 @@ def _as_built_lines(result: Outcome, as_built: bool) -> Iterator[str]:
     if count := len(result.l1_as_built):
         l1, psnr = (np.array([*errors.values()]) for errors in (result.l1_as_built, result.psnr_as_built))
         training = "trained as built" if as_built else "nominal training"
-        yield f"{count} perturbed cameras of no training, mean ± standard deviation ({training}):"
+        yield f"{count} perturbed cameras that training never draws, mean ± standard deviation ({training}):"
         yield f"  L1                               {l1.mean():.5f} ± {l1.std():.5f}"
         spread = f"{psnr.mean():.3f} ± {psnr.std():.3f} dB, least {psnr.min():.3f} dB"
         yield f"  PSNR                             {spread}"

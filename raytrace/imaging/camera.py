@@ -159,7 +159,7 @@ class Camera(nn.Module, Generic[V]):
         if self.element is not None and not isinstance(self.element, PhaseVariables):
             raise TypeError(f"Camera: `element` is {named_value(self.element)}; expected PhaseVariables(element)")
         if is_alone and self.element is not None:
-            raise ValueError("an element at the stop of an element: give others=… to its PhaseVariables")
+            raise ValueError("two elements without a lens: give the second one in others=… of PhaseVariables")
         if is_alone != (self.sensor_distance is not None):
             needed = "give sensor_distance=…, mm" if is_alone else "leave sensor_distance out: the lens has it"
             raise ValueError(f"a camera {'of an element without' if is_alone else 'with'} a lens: {needed}")
@@ -415,7 +415,7 @@ class Camera(nn.Module, Generic[V]):
             )
         if (most := float(light.detach().max())) > _LARGEST:
             raise ValueError(
-                f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"
+                f"a picture with values up to {most:g}: expected 0 to 1, as noise assumes; divide it by its white"
             )
         return light
 

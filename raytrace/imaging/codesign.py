@@ -503,8 +503,9 @@ def run_model(
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
     folder: of this run, resumed if started; about: other inputs that determine the result (lens file, pictures);
-    progress: wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the training.
-    At the end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
+    progress: wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the
+    training. At the end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by
+    `outcome`.
     """
     folder = Path(folder)
 
