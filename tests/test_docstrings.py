@@ -72,7 +72,8 @@ def is_there(dotted: str, name: str) -> bool:
     if words[-1:] in [[code] for code in CODE]:
         return any(PACKAGE.rglob(dotted)) or (Path(__file__).parent / dotted).exists()
     if dotted in MODULES or first == "rt":
-        return dotted in MODULES or words[0] in raytrace.PUBLIC
+        word = words[1] if words[0] in raytrace.NAMESPACES and len(words) > 1 else words[0]
+        return dotted in MODULES or word in raytrace.PUBLIC or word in raytrace.ERRORS
     within = (package_of(name), *LIBRARY)
     homes = [module(one) for one in MODULES if one.split(".")[-1] == first and package_of(one) in within]
     homes += [getattr(home, first) for home in (module(name), raytrace) if hasattr(home, first)]

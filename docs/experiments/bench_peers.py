@@ -46,7 +46,7 @@ from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, media, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.table import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene
 
@@ -306,7 +306,7 @@ class _Given:
 
 
 def tolerancing(
-    tolerances: Tolerances, errors: Tensor, rings: int, done: Callable[[], object], threads: int
+    tolerances: ToleranceTable, errors: Tensor, rings: int, done: Callable[[], object], threads: int
 ) -> tuple[list[float], list[float]]:
     """Optiland's tolerancing of its Cooke triplet with errors (L, N): the root of the mean square, mm, and s, of each.
 

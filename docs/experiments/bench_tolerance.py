@@ -32,7 +32,7 @@ from raytrace.tolerancing.criteria import Criterion, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.study import Study, View
-from raytrace.tolerancing.table import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays, spot_of
@@ -93,7 +93,7 @@ def triplet() -> Lens:
     )  # fmt: skip
 
 
-def tolerances() -> Tolerances:
+def tolerances() -> ToleranceTable:
     """Radius, thickness, decentres and a tilt of every surface, but no decentre of the first.
 
     In Optiland the beam follows a decentre of the first surface, here the entrance pupil stays.
@@ -103,7 +103,7 @@ def tolerances() -> Tolerances:
     for axis in "xy":
         rows += [Tolerance(f"element_decenter_{axis}", (k, k), -0.05, 0.05) for k in range(2, 7)]
     rows += [Tolerance(f"element_tilt_{'xy'[k % 2]}", (k, k), -0.05, 0.05) for k in range(1, 7)]
-    return Tolerances(tuple(rows), (Compensator(6),))
+    return ToleranceTable(tuple(rows), (Compensator(6),))
 
 
 def sampling(lens: Lens, points: Tensor, weights: Tensor) -> Sampling:

@@ -16,13 +16,13 @@ from raytrace.system.tolerance_data import Compensator
 from raytrace.tolerancing.criteria import CRITERIA, Sampling
 from raytrace.tolerancing.perturbation import perturbed
 from raytrace.tolerancing.study import sampling_of
-from raytrace.tolerancing.table import BadTolerance, Tolerances
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
 from raytrace.tracing.focus import along_normal, shift_to_focus
 
 _RINGS = 6  # of the pupil
 
 
-def lens_as_built(lens: Lens, tolerances: Tolerances, errors: Tensor | Sequence[float], fields: Tensor) -> Lens:
+def lens_as_built(lens: Lens, tolerances: ToleranceTable, errors: Tensor | Sequence[float], fields: Tensor) -> Lens:
     """The lens with errors (N,), or a lens for each row of (L, N), focused again where the sensor is the compensator.
 
     fields: (2, F) over which the mean square spot radius is least, all wavelengths about one centroid, for an object at
@@ -39,7 +39,7 @@ def lens_as_built(lens: Lens, tolerances: Tolerances, errors: Tensor | Sequence[
     return with_sensor_distance(built, distance.reshape(-1) + shift if built.count else distance + shift[0])
 
 
-def sensor_compensator(lens: Lens, tolerances: Tolerances) -> Compensator | None:
+def sensor_compensator(lens: Lens, tolerances: ToleranceTable) -> Compensator | None:
     """The sensor distance as compensator; None where nothing is adjusted. Raises BadTolerance for another one."""
     last = len(lens.surfaces) - 2
     for compensator in tolerances.compensators:

@@ -59,7 +59,7 @@ from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.table import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
@@ -123,7 +123,7 @@ class Camera(nn.Module, Generic[V]):
         illumination: bool = False,
         tol: float = 1e-2,
         network_dtype: torch.dtype | None = None,
-        tolerances: Tolerances | None = None,
+        tolerances: ToleranceTable | None = None,
     ):
         super().__init__()
         if not isinstance(variables, Variables | PhaseVariables):

@@ -52,7 +52,7 @@ from raytrace.system.lens import Lens, with_object_distance, with_sensor_distanc
 from raytrace.system.parameter_paths import GLASS, parse_range
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.sampling import draw_errors
-from raytrace.tolerancing.table import Tolerances
+from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers
@@ -120,7 +120,7 @@ def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor |
     return sobol(count, seed=seed)[0]
 
 
-def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> Tolerances | None:
+def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> ToleranceTable | None:
     """Tolerances of an experiment, of its grade and limits or of the file; None without. Raises BadTolerance."""
     if not settings.is_toleranced:
         return None
@@ -259,7 +259,7 @@ def batch(
     settings: CodesignSettings,
     samples: list[int],
     epoch: int,
-    tolerances: Tolerances | None = None,
+    tolerances: ToleranceTable | None = None,
 ) -> Batch:
     """The samples of an epoch with these numbers; object distances are uniform in z or in 1/z.
 
@@ -320,7 +320,7 @@ def steps_per_epoch(pictures: Pictures, settings: CodesignSettings) -> int:
 class Batches:
     """The batches of a run by step; the next one is prepared by a thread while a step is taken."""
 
-    def __init__(self, pictures: Pictures, settings: CodesignSettings, tolerances: Tolerances | None = None):
+    def __init__(self, pictures: Pictures, settings: CodesignSettings, tolerances: ToleranceTable | None = None):
         self.pictures, self.settings, self.tolerances = pictures, settings, tolerances
         self.steps_per_epoch = steps_per_epoch(pictures, settings)
         self._thread = ThreadPoolExecutor(1)

@@ -139,10 +139,6 @@ class ToleranceTable(Result):
         }
 
 
-#: Former name.
-Tolerances = ToleranceTable
-
-
 def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
     """The places of the rows of each group, in the order of its first row."""
     groups: dict[str | int, list[int]] = {}
