@@ -259,25 +259,10 @@ ERRORS = {
 #: others are names of their packages, `rt.imaging.blur`.
 TOP = (
     *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "view", "glass", "to"),
-    *("trace", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare"),
-    *(
-        "ray_fan",
-        "opd_fan",
-        "distortion",
-        "distortion_grid",
-        "field_curvature",
-        "lateral_colour",
-        "seidel",
-        "incidence",
-    ),
-    *(
-        "chromatic_focal_shift",
-        "longitudinal_aberration",
-        "encircled_energy",
-        "relative_illumination",
-        "rms_over_field",
-    ),
-    *("optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
+    *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
+    *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
+    *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
+    *("rms_over_field", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
     *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
 )
 #: Packages whose public names are typed with them.

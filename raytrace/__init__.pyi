@@ -118,6 +118,7 @@ from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.jacobian import NoDerivatives as NoDerivatives
 from raytrace.tolerancing.jacobian import jacobian as jacobian
 from raytrace.tolerancing.table import BadTolerance as BadTolerance
+from raytrace.tracing.base_ray import base_ray as base_ray
 from raytrace.tracing.compiler import NoCompiler as NoCompiler
 from raytrace.tracing.compiler import Untrusted as Untrusted
 from raytrace.tracing.focus import NoImage as NoImage

@@ -23,7 +23,7 @@ def near(found, expected, tolerance=1e-9):
 @pytest.mark.parametrize("distance", [math.inf, 2000.0])
 def test_it_is_first_order_where_the_axis_is_straight(distance):
     lens = rt.read_lens("double_gauss").at(object_distance=distance)
-    straight, found = rt.first_order(lens), rt.tracing.base_ray(lens)
+    straight, found = rt.first_order(lens), rt.base_ray(lens)
     pairs = {"focal_length": "effective_focal_length", "image_distance": "paraxial_image_distance"}
     same = (
         "back_focal_distance", "entrance_pupil_position", "entrance_pupil_diameter", "exit_pupil_position",
@@ -39,7 +39,7 @@ def test_it_is_first_order_where_the_axis_is_straight(distance):
 def test_a_tilted_sphere_has_the_foci_of_coddington(degrees):
     """f_t = (R/2) cos θ, f_s = R/(2 cos θ), from the mirror along the ray, the stop there."""
     lens = bends.tilted_mirror(-200.0, degrees, 80.0)
-    found, c = rt.tracing.base_ray(lens), math.cos(math.radians(degrees))
+    found, c = rt.base_ray(lens), math.cos(math.radians(degrees))
     assert near(found.focal_length, [100 * c, 100 / c], 1e-12)
     assert near(found.back_focal_distance, [100 * c, 100 / c], 1e-12)
     assert near(found.exit_pupil_position, [-80.0, -80.0], 1e-12)
@@ -51,7 +51,7 @@ def test_a_tilted_sphere_has_the_foci_of_coddington(degrees):
 def test_a_tilted_mirror_images_an_object_twice():
     """1/s + 1/s′ = 2/(R cos θ) and 2 cos θ/R; the magnifications are -s′/s."""
     s, c = 300.0, math.cos(math.radians(20.0))
-    found = rt.tracing.base_ray(bends.tilted_mirror(-200.0, 20.0, 80.0, object_distance=s))
+    found = rt.base_ray(bends.tilted_mirror(-200.0, 20.0, 80.0, object_distance=s))
     images = [1 / (1 / (100 * c) - 1 / s), 1 / (c / 100 - 1 / s)]
     assert near(found.image_distance, images, 1e-12)
     assert near(found.magnification, [-image / s for image in images], 1e-12)
@@ -64,7 +64,7 @@ def test_a_decentred_parabola_is_a_stigmatic_mirror():
     parabola = {"radius": -2 * f, "conic": -1.0, "glass": "MIRROR", "thickness": -f}
     lens = rt.lens([{"thickness": 0.0}, parabola], stop=1, entrance_pupil_diameter=30.0)
     lens = bends.inserted(lens, 1, [away])
-    found = rt.tracing.base_ray(lens)
+    found = rt.base_ray(lens)
     assert near(found.back_focal_distance, [f + h * h / (4 * f)] * 2, 1e-12)
     assert near(found.focal_length, [f + h * h / (4 * f)] * 2, 1e-12)
     assert float(rt.spot(lens).rms_radius.max()) < 1e-12
@@ -87,7 +87,7 @@ def test_a_tilted_plate_is_astigmatic_and_moves_the_ray():
         stop=1,
         entrance_pupil_diameter=5.0,
     )
-    found = rt.tracing.base_ray(lens)
+    found = rt.base_ray(lens)
     way = t / math.cos(inside)
     foci = [f - 40 - way * math.cos(theta) ** 2 / (n * math.cos(inside) ** 2), f - 40 - way / n]
     # They count from the plane of the rear vertex, which lies t cos θ behind the front one and t sin θ off it.
@@ -109,15 +109,15 @@ def test_a_grating_is_anamorphic():
         entrance_pupil_diameter=5.0,
         wavelengths=[0.5],
     )
-    assert near(rt.tracing.base_ray(lens).focal_length, [f / math.sqrt(1 - slope**2), f], 1e-12)
-    assert near(rt.tracing.base_ray(lens).back_focal_distance, [f, f], 1e-9)
+    assert near(rt.base_ray(lens).focal_length, [f / math.sqrt(1 - slope**2), f], 1e-12)
+    assert near(rt.base_ray(lens).back_focal_distance, [f, f], 1e-9)
 
 
 def test_a_cylinder_has_one_focal_length():
     lens = rt.lens(
         [{"thickness": 50.0, "phase": rt.system.IdealLens(0.0, 1 / 50)}], stop=1, entrance_pupil_diameter=5.0
     )
-    found = rt.tracing.base_ray(lens)
+    found = rt.base_ray(lens)
     assert near(found.focal_length, [50.0, math.inf])
     assert near(found.back_focal_distance, [50.0, math.inf])
     assert not is_bent(lens)
@@ -172,7 +172,7 @@ def test_pupil_points_keep_their_side_behind_a_turned_stop():
 def test_a_telecentric_relay_has_the_pupils_and_the_magnification_of_first_order_data(capsys):
     """Two ideal lenses of 50 mm, the stop 1.165 µm from their common focus, a tilted image."""
     lens = rt.read_lens(Path(__file__).parent / "cases" / "telecentric.zmx")
-    base, straight = rt.tracing.base_ray(lens), rt.first_order(lens)
+    base, straight = rt.base_ray(lens), rt.first_order(lens)
     assert base.magnification.tolist() == pytest.approx([-1, -1], rel=1e-9)
     assert float(straight.magnification) == pytest.approx(-1, rel=1e-9)
     distance = 50 + 50**2 / 0.001165  # of the image of the stop by the second lens
@@ -204,7 +204,7 @@ def test_it_is_differentiated_exactly():
             entrance_pupil_diameter=8.0,
             object_distance=400.0,
         )
-        found = rt.tracing.base_ray(lens)
+        found = rt.base_ray(lens)
         mm = "focal_length image_distance entrance_pupil_position exit_pupil_position exit_pupil_diameter position"
         return tuple(getattr(found, name) for name in (*mm.split(), "paraxial_working_f_number", "magnification"))
 

@@ -135,7 +135,7 @@ UNKNOWN = {
 def test_a_substitute_is_taken_where_it_is_asked_for_and_reported(suffix, tmp_path):
     path = tmp_path / f"lens{suffix}"
     path.write_text(UNKNOWN[suffix], encoding="utf-8")
-    with pytest.raises(UnknownGlass, match=r"--substitute XK99"):
+    with pytest.raises(UnknownGlass, match=r"substitute=XK99"):
         read_lens(path)
     wanted = find_glass("N-BK7").coefficients
     for asked in ({"XK99": "N-BK7"}, "xk99=N-BK7", ["XK99=N-BK7"]):

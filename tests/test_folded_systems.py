@@ -266,7 +266,7 @@ def toroid() -> rt.Lens:
 
 
 def test_a_toroid_has_the_foci_of_its_sections():
-    found = rt.tracing.base_ray(toroid())
+    found = rt.base_ray(toroid())
     assert found.focal_length.tolist() == pytest.approx([100.0, 120.0], abs=1e-9)
     assert found.back_focal_distance.tolist() == pytest.approx([100 - 4 / 1.5, 120 - 4 / 1.5], abs=1e-9)
     curvature = rt.field_curvature(toroid(), fields=[0.0])

@@ -81,7 +81,7 @@ def test_models_are_compared_where_a_surface_is_curved():
     ideal = rt.lens(
         [dict(thickness=50.0, phase=rt.system.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
     )
-    with pytest.raises(ValueError, match=r"no surface .* is curved; ask for kernels"):
+    with pytest.raises(ValueError, match=r"no .*surface .*is curved; ask for kernels"):
         abilities(ideal)
 
 

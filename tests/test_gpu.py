@@ -50,7 +50,7 @@ ANALYSES = {
     "spot": rt.spot,
     "spot of many": lambda lens: rt.spot(lens, rays=100_000),
     "rays": lambda lens: rt.tracing.rays(lens, fields=[0, 5]),
-    "base_ray": rt.tracing.base_ray,
+    "base_ray": rt.base_ray,
     "trace": lambda lens: rt.trace(lens, fields=[5]),
     "focus": lambda lens: rt.focus(lens).lens.surfaces[-2].thickness,
     "wavefront": rt.wavefront,

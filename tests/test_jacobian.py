@@ -230,7 +230,7 @@ def test_a_quantity_without_derivatives_is_reported():
 def test_derivatives_of_a_base_ray_are_its_gradients(name):
     """Its focal lengths follow from gradients that the function takes itself."""
     bent = GAUSS.replace(3, tilt_x=1.0)
-    assert_gradients(lambda lens: getattr(rt.tracing.base_ray(lens), name), bent, "curvature:1,3 tilt:3 decentre:5")
+    assert_gradients(lambda lens: getattr(rt.base_ray(lens), name), bent, "curvature:1,3 tilt:3 decentre:5")
 
 
 def test_wrong_quantities_are_refused():

@@ -184,7 +184,7 @@ def test_a_verb_that_reads_numbers_names_itself_under_vmap(function, singlet):
     [
         lambda lens: rt.first_order(lens).power,
         lambda lens: rt.tracing.rays(lens).position,
-        lambda lens: rt.tracing.base_ray(lens).position,
+        lambda lens: rt.base_ray(lens).position,
         lambda lens: (
             spot_of(
                 trace_lens(lens, launch(lens, rt.maths.gauss_rings(3)[0]), lens.wavelengths[:, None]),

@@ -168,7 +168,7 @@ def test_values_and_batches_print_large_tensors_by_shape_and_range():
     values += [
         rt.tracing.rays(lens),
         rt.spot(lens).whole,
-        rt.tracing.base_ray(lens),
+        rt.base_ray(lens),
         rt.trace(lens),
         rt.first_order(batch),
     ]

@@ -344,15 +344,15 @@ def test_wrong_arrays_are_refused(numbers, options, message):
 
 
 def test_an_array_alone_is_no_element():
-    with pytest.raises(TypeError, match=r"ndarray .*expected .*rt\.element\(heights"):
+    with pytest.raises(TypeError, match=r"ndarray .*expected .*rt\.wave_optics\.phase_element\(heights"):
         rt.wave_optics.wave_psf(np.zeros((9, 9)))
-    with pytest.raises(TypeError, match=r"`elements` is 'cubic'; expected .*rt\.elements"):
+    with pytest.raises(TypeError, match=r"`elements` is 'cubic'; expected .*phase_elements"):
         rt.wave_optics.hybrid_psf("double_gauss", "cubic")
 
 
 @pytest.mark.parametrize("function", [rt.wave_optics.phase_elements, rt.wave_optics.read_element])
 def test_an_array_in_place_of_a_file_is_refused_with_the_function_that_takes_it(function):
-    with pytest.raises(TypeError, match=r"ndarray; expected a path .*rt\.element\("):
+    with pytest.raises(TypeError, match=r"ndarray; expected a path .*phase_element\("):
         function(np.zeros((4, 4)), aperture=1.0)
 
 
