@@ -142,14 +142,8 @@ class Camera(nn.Module, Generic[V]):
         self.fields = self._fields_of_sensor() if fields is None else field_points(fields, like=lens)
         self.points = self.sensor.landing(lens, self.fields).detach() if fields is None else None
         warn_of_filling(lens, self.fields)
-        self.size, self.center, self.normalise, self.tol, self.network_dtype = (
-            pixels,
-            center,
-            normalise,
-            tol,
-            network_dtype,
-        )
-        self.tolerances = tolerances
+        self.size, self.center, self.normalise = pixels, center, normalise
+        self.tol, self.network_dtype, self.tolerances = tol, network_dtype, tolerances
         self.use(model or ("wave" if self.elements() else "gaussian"))
         self._memo = Memo(object_distances=object_distances)
 
