@@ -584,3 +584,14 @@ def test_a_camera_in_single_precision_has_the_same_kernels(triplet):
     assert float((kernels - double).abs().sum((-2, -1)).max()) < 1e-3
     kernels.square().sum().backward()
     assert all(bool(torch.isfinite(p.grad)) for p in single.variables.parameters())
+
+
+def test_a_field_number_and_all_fields_have_the_same_kernels_after_the_lens_has_changed(triplet):
+    """The fields of a sensor are points of it: their kernels stay there, by number as well as over the field."""
+    own = made(triplet)
+    with torch.no_grad():
+        own.variables.get_parameter(own.variables.names[0]).add_(0.05)
+        distances = torch.tensor([12e3, 40e3], dtype=torch.float64)
+        whole = own.kernels_over_field(distances)
+        for field in range(own.fields.shape[1]):
+            torch.testing.assert_close(own.kernels(distances, field), whole[:, field], rtol=0, atol=1e-12)

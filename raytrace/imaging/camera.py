@@ -310,6 +310,8 @@ class Camera(nn.Module, Generic[V]):
         """
         distances, lens = self._distances(object_distances), self.lens()
         count = len(distances)
+        if points is None and self.points is not None:
+            points = self._of_field(self.points, field, count)
         if points is not None:
             check_points(points, count)
             points, lens = points.to(self.fields), by_angle(lens)
@@ -330,7 +332,8 @@ class Camera(nn.Module, Generic[V]):
         if errors is None and points is not None:
             kernels = about.paired(points)
         else:
-            fields = self._fields(field, count) if points is None else self.sensor.fields(lens, points)
+            at_field = self._of_field(self.fields, field, count)
+            fields = at_field if points is None else self.sensor.fields(lens, points)
             if errors is not None:
                 built = self.as_built(errors)
                 if built.count not in (None, count):
@@ -342,27 +345,27 @@ class Camera(nn.Module, Generic[V]):
             kernels = about.of_pairs(fields.nan_to_num(0.0))
             kernels = torch.where(arrives[:, None, None, None], kernels, 0.0)
         if points is None and (self.illumination or bool((kernels.detach() == 0).all((1, 2, 3)).any())):
-            points = self.sensor.landing(lens, self._fields(field, count))
+            points = self.sensor.landing(lens, self._of_field(self.fields, field, count))
         if points is not None:
             warn_of_dark_places(kernels, points)
         if self.illumination and points is not None:
             kernels = kernels * illumination_at(lens, self.sensor, points)[:, None, None, None]
         return kernels
 
-    def _fields(self, field: int | Sequence[int], count: int) -> Tensor:
-        """Field points (2, B) of one of the camera's fields, or of one for each of B images."""
-        return self.fields[:, torch.as_tensor(field, device=self.fields.device).expand(count)]
+    @staticmethod
+    def _of_field(places: Tensor, field: int | Sequence[int], count: int) -> Tensor:
+        """Places (2, B), of the camera's (2, F), at one number of a field, or at one for each of B images."""
+        return places[:, torch.as_tensor(field, device=places.device).expand(count)]
 
     def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at the camera's fields, or at points (2, N) mm."""
         distances = self._distances(object_distances)
-        points = self.points if points is None else points
         count = self.fields.shape[1] if points is None else points.shape[1]
-        pairs = distances.repeat_interleave(count), [*range(count)] * len(distances)
+        each, places = distances.repeat_interleave(count), [*range(count)] * len(distances)
         if points is None:
-            kernels = self.kernels(*pairs)
+            kernels = self.kernels(each, places)
         else:
-            kernels = self.kernels(pairs[0], points=points.to(distances)[:, pairs[1]])
+            kernels = self.kernels(each, points=points.to(distances)[:, places])
         return kernels.unflatten(0, (len(distances), -1))
 
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
