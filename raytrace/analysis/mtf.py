@@ -50,6 +50,8 @@ from raytrace.words import option
 
 _SMOOTH = 241  # sensor distances of a smooth curve
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
+_PROBE_ARMS = 24  # of as many rings, where all rays of all fields are too many at once
+_MARGIN = 3  # orders of `rings_and_arms`, by which aberrations of high order are integrated to 1e-5
 _LEAST_PHASE = 70.0  # radians along a pupil radius that the former integrate, see `rings_and_arms`
 _FREQUENCIES, _DISTANCES = 41, 21  # default numbers of them
 _BUNDLES = 16  # stored of a field: its probe and the fits of its wave
@@ -440,14 +442,15 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
     """Tangential and sagittal MTF (F, K) of rays, as many as the blur needs."""
     pupil = gauss_rings(_LEAST_RINGS, 4 * _LEAST_RINGS, **like(lens))
     if _together(lens, pupil) < fields.shape[1]:
+        probe = gauss_rings(_LEAST_RINGS, _PROBE_ARMS, **like(lens))[0]
         with torch.no_grad():
-            rays = image_rays(lens, gauss_rings(6, **like(lens))[0], fields=fields)
+            rays = image_rays(lens, probe, fields=fields)
     else:
-        rays = image_rays(lens, pupil[0], fields=fields)
+        probe, rays = pupil[0], image_rays(lens, pupil[0], fields=fields)
     with torch.no_grad():
-        reach = torch.where(rays.valid, rays.position[:2], torch.nan)
-        blur = (reach - reach.nanmean(-1, keepdim=True)).abs().nan_to_num(0.0).max()
-        rings, arms = rings_and_arms(2 * math.pi * float(blur * frequencies.max()), 0)
+        along, around = _steepness(probe, torch.where(rays.valid, rays.position[:2], torch.nan))
+        turns = 2 * math.pi * float(frequencies.max())
+        rings, arms = rings_and_arms(turns * along, _MARGIN)[0], rings_and_arms(turns * around, _MARGIN)[1]
     rings, arms = max(rings, _LEAST_RINGS), max(arms, 4 * _LEAST_RINGS)
     if rings * arms > _MOST_RAYS:
         raise TooManyPoints(
@@ -466,8 +469,22 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
     return tangential, sagittal
 
 
+def _steepness(points: Tensor, hits: Tensor) -> tuple[float, float]:
+    """Largest 2 |∂/∂θ| and |∂/∂φ| in mm of the hits (2, ..., P) of pupil points (2, P) in `_LEAST_RINGS` rings.
+
+    Rings have the radius cos(θ/2), in which a Gauss rule has equally spaced θ; φ: azimuth. Where the image is linear in
+    the pupil both are its radius; aberrations of high order are steeper, and take more rings and arms.
+    """
+    each = hits.unflatten(-1, (_LEAST_RINGS, -1))
+    angle = 2 * torch.arccos(torch.hypot(*points).reshape(_LEAST_RINGS, -1)[:, :1])
+    along = 2 * (each.diff(dim=-2) / angle.diff(dim=0)).abs().nan_to_num(0.0).max()
+    around = (each.roll(-1, -1) - each).abs().nan_to_num(0.0).max() / (2 * math.pi / each.shape[-1])
+    return float(along), float(around)
+
+
 def least_reach(blur: float) -> float:
-    """The frequency in cycles/mm up to which the fewest rays give the MTF of spots of a radius `blur` mm."""
+    """The frequency in cycles/mm up to which the fewest rays give the MTF of an image linear in the pupil, `blur` mm
+    in radius; aberrations of high order take more rays (`_steepness`)."""
     return _LEAST_PHASE / (2 * math.pi * blur) if blur > 0 else math.inf
 
 
