@@ -126,15 +126,11 @@ def _of_file(path: str, kind: type) -> dict:
         raise BadSettings(f"{path}: no TOML, and no JSON of a run ({error})") from error
     if not isinstance(document, dict):
         raise BadSettings(f"{path}: expected settings by their names")
-    entries: dict = {}
+    entries: dict[str, object] = {}
     for name, entry in document.items():
-        entries |= entry if isinstance(entry, dict) else {name: entry}
-    known = defaults_of(kind)
-    return {
-        name: _checked(kind, name, entry, path)
-        for name, entry in entries.items()
-        if name in known or (name not in _OF_RUNS and not isinstance(document.get("world"), dict))
-    }
+        if name not in _OF_RUNS:
+            entries |= entry if isinstance(entry, dict) else {name: entry}
+    return {name: _checked(kind, name, entry, path) for name, entry in entries.items()}
 
 
 def _checked(kind: type, name: str, entry: object, where: str) -> object:

@@ -272,9 +272,12 @@ class Camera(nn.Module, Generic[V]):
 
     def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
         """The lens with errors (N,), or a lens for each row of (L, N), refocused by its sensor distance."""
+        return self._built(self.lens(), errors)
+
+    def _built(self, lens: Lens, errors: Tensor | Sequence[float]) -> Lens:
         if self.tolerances is None:
             raise ValueError("errors, but no tolerances: give Camera(…, tolerances=rt.tolerances(lens, grade=…))")
-        return lens_as_built(self.variables(), self.tolerances, errors, self.fields)
+        return lens_as_built(lens, self.tolerances, errors, self.fields)
 
     @torch.no_grad()
     def plan(self) -> int:
@@ -308,13 +311,13 @@ class Camera(nn.Module, Generic[V]):
         the object points are those that the nominal lens images at these places. PSFs are 0 where no light arrives,
         with the warning DarkPlaces. Raises ValueError for points that are not finite.
         """
-        distances, lens = self._distances(object_distances), self.lens()
-        count = len(distances)
+        distances, nominal = self._distances(object_distances), self.lens()
+        lens, count = nominal, len(distances)
         if points is None and self.points is not None:
             points = self._of_field(self.points, field, count)
         if points is not None:
             check_points(points, count)
-            points, lens = points.to(self.fields), by_angle(lens)
+            points, lens = points.to(self.fields), by_angle(nominal)
         about = field_kernels(
             lens,
             self.sensor,
@@ -335,7 +338,7 @@ class Camera(nn.Module, Generic[V]):
             at_field = self._of_field(self.fields, field, count)
             fields = at_field if points is None else self.sensor.fields(lens, points)
             if errors is not None:
-                built = self.as_built(errors)
+                built = self._built(nominal, errors)
                 if built.count not in (None, count):
                     raise ValueError(
                         f"errors of {built.count} lenses at {count} object distances: expected one for each"
