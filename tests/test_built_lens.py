@@ -264,7 +264,7 @@ def test_wrong_cameras_as_built_are_refused(lens):
 
 
 def test_a_sensor_in_colour_takes_lenses_as_built(lens):
-    """Kernels of each channel at a place are those of the perturbed lens at the field point that the nominal one images
+    """A channel has at each place the kernel of the perturbed lens at the field point that the nominal one images
     there, about its own chief ray."""
     lens = lens.at(wavelengths=(0.48, 0.53, 0.62), ray_aiming="real")
     sensor = rt.Sensor((24, 16), (2400, 1600), response="rgb")

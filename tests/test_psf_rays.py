@@ -207,7 +207,7 @@ def test_cells_of_a_focus_smaller_than_a_pixel_are_finite():
 
 
 def test_pupil_points_are_the_rays_of_a_kernel():
-    """As many Sobol rays are those of their number; a Gaussian has their centroid and covariance."""
+    """As many Sobol rays give the kernel of their number; a Gaussian has their centroid and covariance."""
     lens = read_lens("double_gauss").at(ray_aiming="real", wavelengths=(0.48, 0.53, 0.62))
     about = {"fields": [0, 10], "object_distances": [2e4, 3e4]}
     points = sobol(64)[0]

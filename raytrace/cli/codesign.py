@@ -220,7 +220,7 @@ def experiment_options(parser: argparse.ArgumentParser) -> None:
     picture_options(parser, "folder of pictures, in any subfolders; four fifths train, the others test")
     experiment = parser.add_argument_group(
         "experiment",
-        "With --sensor the camera is that of a product: colour, the whole field, its noise, and the\n"
+        "With --sensor the camera is a product: colour, the whole field, its noise, and the\n"
         "wavelengths of the file unless --wavelength names others. Errors of manufacture are drawn by\n"
         "the number of the sample.",
     )

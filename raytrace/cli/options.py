@@ -35,10 +35,10 @@ Adder: TypeAlias = Callable[[argparse._ActionsContainer], object]
 
 @dataclass(frozen=True)
 class Option:
-    """An option, whose value is that of a parameter of the public function.
+    """An option, which gives a parameter of the public function its value.
 
     name: the parameter; reader: of the text of a value; flag: by default --name, two with a space between them, or
-    the name itself for a positional argument; default: that of the parameter, which completes the help text, or None
+    the name itself for a positional argument; default: the parameter's, which completes the help text, or None
     where the function has its own; nargs, choices, action, required: as for `argparse`.
     """
 

@@ -69,7 +69,7 @@ def carry_out(arguments: argparse.Namespace) -> int:
 
 
 def _run_of(arguments: argparse.Namespace) -> Run:
-    """The function that a command runs: that of its row, else its public function with a lens."""
+    """The function that a command runs: the one its row names, else its public function with a lens."""
     command = arguments.run
     if command.run:
         module, _, name = command.run.partition(":")

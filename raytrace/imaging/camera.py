@@ -79,7 +79,7 @@ class Camera(nn.Module, Generic[V]):
 
     variables: of the lens, or of a phase element without a lens, `sensor_distance` mm before the sensor, at wavelengths
     (W,) µm as for `render`; element: variables of one at the stop of the lens.
-    network: (B, C, h, w) -> the same; sensor: its response, noise, quantisation and mosaic are those of the images; by
+    network: (B, C, h, w) -> the same; sensor: gives the images its response, noise, quantisation and mosaic; by
     default `rt.Sensor()`, grey and without noise. Whole pictures: see `render`.
     model: a PSF model or its name, by default "gaussian", with elements "wave". Gaussian(rays=points) and
     DRT(rays=points) take the rays of these pupil points, instead of as many as `tol` needs.
@@ -211,7 +211,7 @@ class Camera(nn.Module, Generic[V]):
     def rates(self, *, optics: float, network: float, element: float | None = None) -> list[dict]:
         """Parameter groups for an optimiser of torch: the variables and the network, each with its learning rate.
 
-        element: learning rate of the heights of an element at the stop, by default that of the variables.
+        element: learning rate of the heights of an element at the stop, by default the rate of the variables.
         """
         groups = [
             {"params": [*self.variables.parameters()], "lr": optics},

@@ -209,7 +209,7 @@ class FieldKernels:
         """Kernels (F, D, C, size, size) of field points (2, F); of a batch of D lenses one for each.
 
         By the PSF model, field by field; the chief rays of all fields are aimed and traced at once. of_points: the
-        field points are those of points of the sensor, which vary with the lens.
+        field points belong to points of the sensor, and vary with the lens.
         """
         count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
         kernels = []

@@ -416,8 +416,8 @@ def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
 
 
 def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
-    """Gaussians of the rays through pupil points (2, P), all of one weight: their centroid and covariance, not those of
-    all light."""
+    """Gaussians of the rays through pupil points (2, P), all of one weight: with their centroid and covariance, which
+    differ from the moments of all light."""
     traced = trace_scene(scene, points)
     arrives = (traced.valid.to(traced.position) / points.shape[1]).expand(*scene.shape, -1)
     centroid, covariance = moments_of_rays(traced.position[:2].expand(2, *arrives.shape), arrives)
