@@ -92,6 +92,22 @@ def hexapolar(
     return _tensors(np.concatenate(points, axis=1), np.concatenate(weights) / rings**2, dtype, device)
 
 
+def equal_rings(
+    rings: int = 8, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Rings of 2·rings points (at least 8) at the mean r² of rings of equal area: all points share the light equally.
+
+    The error of the mean of a function smooth in r² falls as 1/rings².
+    """
+    _at_least_one("equal_rings", rings=rings)
+    arms = max(8, 2 * rings)
+    _afford(rings * arms, f"{rings} equal rings", "rings")
+    radius = np.sqrt((np.arange(rings) + 0.5) / rings)
+    angle = (np.arange(arms) + 0.5) * (2 * math.pi / arms)
+    points = np.stack([np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()])
+    return _equal(points, dtype, device)
+
+
 def square(
     across: int = 16, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:

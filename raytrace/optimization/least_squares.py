@@ -1,4 +1,4 @@
-"""Solvers: damped least squares under bounds and conditions, descents with several dampings, and L-BFGS-B.
+"""Solvers: damped least squares under bounds and conditions, descents with several dampings; L-BFGS-B of tensors.
 
 Each cycle of `least_squares` takes the exact Jacobian J of the residuals r, scales variables by its columns and tries
 the step of the damped linear model, bent by the second derivative along it (geodesic acceleration). The ratio of the
@@ -20,7 +20,7 @@ Source: Levenberg 1944, Marquardt 1963, Moré 1978 (scaling); Nielsen 1999 (damp
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.optimize
@@ -71,7 +71,8 @@ class Sides:
 class Linear:
     """The model at a point. residuals (m,), jacobian (m, n); sides; held (h,) = 0 and its slope (h, n).
 
-    lower, upper: (n,) of the step; limits (l,) ≤ 0 and their slope (l, n); scale: D (n,).
+    lower, upper: (n,) of the step; limits (l,) ≤ 0 and their slope (l, n); scale: D (n,); damper: (k, n), of
+    which damping holds |damper p| small, by default the diagonal matrix of D.
     """
 
     def __init__(
@@ -85,8 +86,10 @@ class Linear:
         lower: np.ndarray,
         upper: np.ndarray,
         scale: np.ndarray,
+        damper: np.ndarray | None = None,
     ):
         self.scale = scale
+        self.damper = np.eye(len(scale)) if damper is None else damper / scale
         scaled = jacobian / scale
         if len(scaled) > len(scale):
             basis, self.triangle = np.linalg.qr(scaled)
@@ -120,7 +123,7 @@ class Linear:
 
     def bend(self, second: np.ndarray, damping: float) -> np.ndarray:
         """-(JᵀJ + λ D²)⁻¹ of D⁻¹ Jᵀ r″, in the space that equalities and active bounds leave free."""
-        _, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
+        _, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * self.damper]))
         active = self.least >= -_SLACK
         _, free = _of_equalities(
             np.vstack([self.held[1], self.conditions[active]]), np.zeros(len(self.held[0]) + active.sum())
@@ -135,7 +138,7 @@ class Linear:
 
     def step(self, damping: float, share: float = 1.0) -> np.ndarray:
         """The step (n,); share: part of the violation of equalities and limits that the step removes. Raises NoStep."""
-        basis, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * np.eye(len(self.scale))]))
+        basis, triangle = np.linalg.qr(np.vstack([self.triangle, np.sqrt(damping) * self.damper]))
         target = -basis[: len(self.start)].T @ self.start
         base, free = _of_equalities(self.held[1], -share * self.held[0])
         least = np.where(self.least > 0, share * self.least, self.least)
@@ -250,7 +253,8 @@ _UNLIMITED = 500  # cycles of a path without other limits: along a narrow valley
 class SumOfSquares:
     """A sum of squares and its conditions at x (n,): residuals (m,), sides, held (h,) = 0 and limits (l,) ≤ 0.
 
-    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, empty unless requested.
+    lost: number of failed rays; jacobian, held_slope, limits_slope: derivatives, empty unless requested; damper: as of
+    `Linear`.
     """
 
     x: np.ndarray
@@ -262,10 +266,22 @@ class SumOfSquares:
     jacobian: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     held_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     limits_slope: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
+    damper: np.ndarray | None = None
 
     @property
     def cost(self) -> float:
+        """What a descent lowers."""
         return float(self.residuals @ self.residuals) + self.sides.cost()
+
+    @property
+    def merit(self) -> float:
+        """The cost as it is reported."""
+        return float(np.sqrt(self.cost))
+
+    @property
+    def size(self) -> float:
+        """The scale of the residuals."""
+        return float(np.sqrt(self.cost))
 
     @property
     def missed(self) -> np.ndarray:
@@ -444,7 +460,7 @@ class _LeastSquares:
                 self._raise_damping(True)
                 continue
             trial, step, predicted = tried
-            if self.damping < 1 and predicted <= _ROUNDING * self.state.cost and not is_missed:
+            if self.damping < 1 and predicted <= _ROUNDING * self.state.size**2 and not is_missed:
                 return "gradient"
             if self._accepts(trial, predicted):
                 try:
@@ -467,14 +483,14 @@ class _LeastSquares:
     def _linear(self) -> Linear:
         state = self.state
         columns = np.sqrt((state.jacobian**2).sum(0) + (state.sides.slope[state.sides.excess > 0] ** 2).sum(0))
-        floor = self.options.floor * np.sqrt(self.state.cost) / self.typical
+        floor = self.options.floor * self.state.size / self.typical
         columns = np.sqrt(columns**2 + floor**2)
         columns = np.where(columns > 0, columns, 1.0)
         self.scale = np.maximum(columns, self.scale) if self.options.keeps else columns
         return Linear(
             state.residuals, state.jacobian, sides=state.sides, held=(state.held, state.held_slope),
             limits=(state.limits, state.limits_slope), lower=self.lower - state.x, upper=self.upper - state.x,
-            scale=self.scale,
+            scale=self.scale, damper=state.damper,
         )  # fmt: skip
 
     def _try(self, linear: Linear) -> tuple[SumOfSquares, np.ndarray, float] | None:
@@ -535,7 +551,7 @@ class _LeastSquares:
         return True
 
     def _is_flat(self, linear: Linear) -> bool:
-        size = np.sqrt(self.state.cost)
+        size = self.state.size
         if size == 0:
             return not self.state.missed.any()
         return linear.steepness() <= _FLAT * size and not (self.state.missed > 1e-9).any()
@@ -546,14 +562,14 @@ class _LeastSquares:
         if len(last) <= _IDLE or last[0].missed > max(1e-9, 1.01 * last[-1].missed):
             return ""
         reduction = last[0].merit - last[-1].merit
-        return "merit" if reduction <= self.options.tolerance * last[0].merit else ""
+        return "merit" if reduction <= self.options.tolerance * abs(last[0].merit) else ""
 
     def _report(self, number: int, step: np.ndarray) -> None:
         state = self.state
         length = float(np.linalg.norm(self.scale * step))
         at_bound = int(((state.x <= self.lower) | (state.x >= self.upper)).sum())
         cycle = Cycle(
-            number, float(np.sqrt(state.cost)), float(state.missed.max(initial=0.0)), length, self.damping,
+            number, state.merit, float(state.missed.max(initial=0.0)), length, self.damping,
             self.evaluations, time.monotonic() - self.started, f"{at_bound} at their bounds" if at_bound else "",
         )  # fmt: skip
         self.cycles.append(cycle)
@@ -667,7 +683,6 @@ def best_of_paths(
 
 # -- L-BFGS-B ----------------------------------------------------------------------------------------------------------
 
-_FAR = 1e3  # of the merit at the start: charged where the merit is not finite
 _STEPS = 15_000
 
 
@@ -678,21 +693,11 @@ class NoOptimum(RaytraceWarning):
 Slope: TypeAlias = tuple[float, np.ndarray]  # a value and its gradient
 
 
-class Function(Protocol):
-    """A function of variables (n,): its value and its gradient (n,); evaluations: how often it was called."""
-
-    evaluations: int
-
-    def __call__(self, x: np.ndarray, /) -> Slope: ...
-
-
 def _lbfgsb(
     function: Callable[[np.ndarray], Slope],
     x: np.ndarray,
     scale: np.ndarray | float,
     bounds: np.ndarray | None,
-    *,
-    callback: Callable[[np.ndarray], None] | None = None,
     **options: float,
 ) -> Any:
     """scipy's L-BFGS-B on y = x / scale. function: x -> (value, gradient); bounds: (n, 2) of x, or None."""
@@ -703,64 +708,7 @@ def _lbfgsb(
 
     if bounds is not None:
         bounds = bounds / np.reshape(scale, (-1, 1))
-    return scipy.optimize.minimize(
-        scaled, x / scale, jac=True, method="L-BFGS-B", bounds=bounds, callback=callback, options=options
-    )
-
-
-def minimise(
-    merit: Function,
-    x: np.ndarray,
-    *,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    typical: np.ndarray,
-    cycles: int | None = None,
-    seconds: float | None = None,
-    watch: Callable[[Cycle, np.ndarray], None] | None = None,
-) -> tuple[np.ndarray, str, list[Cycle]]:
-    """Variables at a minimum of a merit that is not a sum of squares, why the descent ended, and its cycles.
-
-    typical: as for `least_squares`.
-    """
-    started = time.monotonic()
-    reports: list[Cycle] = []
-    scale = np.where(np.isfinite(typical), typical, np.maximum(np.abs(x), 1e-3))
-    start = merit(x)[0]
-    least, best, last = start, x, 0.0  # last: s of an evaluation
-
-    def cost(x: np.ndarray) -> Slope:
-        nonlocal least, best, last
-        evaluated = time.monotonic()
-        if seconds is not None and evaluated + last > started + seconds:
-            raise _OutOfTime
-        value, gradient = merit(x)
-        last = time.monotonic() - evaluated
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            return _FAR * max(abs(start), 1.0), np.zeros_like(x)
-        if value < least:
-            least, best = value, x
-        return value, gradient
-
-    def each(y: np.ndarray) -> None:
-        elapsed = time.monotonic() - started
-        reports.append(Cycle(len(reports) + 1, least, 0.0, 0.0, 0.0, merit.evaluations, elapsed))
-        if watch is not None:
-            watch(reports[-1], best)
-        if seconds is not None and elapsed > seconds:
-            raise _OutOfTime
-
-    try:
-        end = _lbfgsb(
-            cost, x, scale, np.stack([lower, upper], -1), callback=each, maxiter=1000 if cycles is None else cycles,
-            ftol=1e-10, gtol=1e-9, maxcor=20,
-        )  # fmt: skip
-        stopped = "cycles" if end.status == 1 else "step" if end.status else "merit"
-    except _OutOfTime:
-        stopped = "seconds"
-    except KeyboardInterrupt:
-        stopped = "interrupted"
-    return best, stopped, reports
+    return scipy.optimize.minimize(scaled, x / scale, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,24 +14,25 @@ import torch
 
 from raytrace.files import check_output
 from raytrace.maths.result import plain
-from raytrace.optimization.attained import NotReached, attained
+from raytrace.optimization.attained import Attained, NotReached, attained
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
-from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths, minimise
+from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths
+from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, merit_for
 from raytrace.optimization.opening import Opened, opened
 from raytrace.optimization.optimized import AsBuiltChange, Optimized
 from raytrace.optimization.problem import (
     Condition,
     ExpectationSettings,
-    FunctionMerit,
     NoProblem,
     Problem,
     conditions_in_unit,
     optimization_data_of,
     typical_of,
 )
+from raytrace.optimization.quantities import Quantity, quantity_of
 from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, name_of, without_glass
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_points
@@ -54,6 +55,11 @@ def optimize(
     lens: Lens,
     *,
     merit: str | Merit | DefaultMerit | Sequence[Row] | Callable[[Lens], torch.Tensor] | None = None,
+    loss: Callable[..., torch.Tensor] | None = None,
+    of: str | Quantity = "points",
+    object_distances: Sequence[float] | None = None,
+    first: str | Merit | DefaultMerit | Sequence[Row] | None = "spot",
+    restarts: int = 2,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = None,
@@ -71,7 +77,12 @@ def optimize(
     """The lens at a minimum of its merit function, by damped least squares with the exact derivatives of every row.
 
     merit: `Merit`, the settings `DefaultMerit` of a default merit function or its kind ("spot", "wavefront", "angular",
-    "mtf"), rows, by default the file's; or any function of a lens that returns one number () to minimise, by L-BFGS.
+    "mtf"), rows, by default the file's; or any function of a lens that returns one number (), a loss without `first`
+    and `restarts`. loss: a function of a quantity of the lens that returns one number () to minimise, by lifted least
+    squares (`optimization.lifted`); of: the quantity, "points", "otf" or "kernels", its settings
+    (`optimization.quantities`), or "lens"; object_distances: (D,) mm at which the quantity of the one lens is taken;
+    first: rows that are minimised first, whose boundaries are met exactly; None for none; restarts: descents from
+    lenses displaced at random by a part of the width of their spots. The end is judged by denser rays (`Optimized`).
     vary: variables, or their syntax, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: constraints met exactly, as "efl=50 total_track<=80" (`optimization.problem`). as_built:
     `AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit. cycles,
@@ -126,46 +137,23 @@ def optimize(
 
     dependencies: dict[str, object] = {}
     if callable(merit):
-        if glasses:
-            raise NoProblem(f"{option('vary', 'glass')} goes with a merit of rows: make the function a row")
-        if hold:
-            raise NoProblem(
-                f"{option('hold')} goes with a merit of rows: of a function give {option('bounds')}, or make it a row"
-            )
-        if as_built is not None:
-            raise NoProblem(
-                f"{option('as_built')} goes with a merit of rows: add `as_built.of(lens).expected` to the function"
-            )
-        if is_stored:
-            dependencies = about(merit=getattr(merit, "__qualname__", type(merit).__name__))
-        function = FunctionMerit(model, merit, stored(dependencies).evaluated)
-        start = np.clip(model.start, lower, upper)
-        with observer(dependencies, lambda x: _lens_at(model, x)) as seen:
-            merit_before = function(model.start)[0]
-            if not np.isfinite(merit_before):
-                raise NoProblem(f"the merit is {merit_before:g} at the start: nothing to follow")
-
-            def each(cycle: Cycle, x: np.ndarray) -> None:
-                seen.after_cycle(cycle, x, evaluated=function.evaluated)
-
-            x, stopped, history = minimise(
-                function, start, lower=lower, upper=upper, typical=typical, cycles=cycles, watch=each,
-                seconds=None if seconds is None else until - time.monotonic(),
-            )  # fmt: skip
-            merit_after = function(x)[0]
-            seen.write(x, merit_after, len(history), evaluated=function.evaluated, now=True)
-        result = _optimized(
-            lens, _lens_at(model, x), model, x, history, merits=(merit_before, merit_after), cycles=len(history),
-            evaluations=function.evaluations, stopped=stopped, seconds=time.monotonic() - started,
-        )  # fmt: skip
-        return _warned(result)
-    rows = merit_for(lens, merit)
+        if loss is not None:
+            raise NoProblem(f"{option('loss')} and a function as {option('merit')}: give one of them")
+        loss, of, first, restarts, merit = merit, "lens", None, 0, None
+    if loss is not None and (glasses or as_built is not None):
+        given = option("vary", "glass") if glasses else option("as_built")
+        raise NoProblem(f"{given} goes with a merit of rows, not with a function: leave it out")
+    rows = merit_for(lens, merit if loss is None else first or "spot")
     conditions, of_rows = conditions_in_unit(lens, hold, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, rows.rows, conditions, as_built=term, **of_rows)
     if is_stored:
         dependencies = about(merit=digest([repr(row) for row in rows.rows], of_rows), hold=digest(repr(conditions)))
         dependencies |= {} if term is None else {"as built": digest(term.about())}
+    if is_stored and loss is not None:
+        name = getattr(loss, "__qualname__", type(loss).__name__)
+        dependencies |= {"loss": name, "of": repr(of), "object distances": plain(object_distances)}
+        dependencies |= {"restarts": restarts, "first": first is not None}
     resumed = stored(dependencies)
     if set(resumed.glasses) - set(glasses):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
@@ -175,10 +163,36 @@ def optimize(
     bounded = {name: pair for name, pair in ends.items() if not np.isinf(pair).all()}
 
     def lens_at(x: np.ndarray) -> Lens:
-        return _lens_at(problem.model, x, rows=problem.rows, unit=problem.unit, bounded=bounded)
+        shown = problem.rows if loss is None else ()
+        return _lens_at(problem.model, x, rows=shown, unit=problem.unit, bounded=bounded)
 
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
+    if loss is not None:
+        measured = Loss.of(loss, quantity_of(of), object_distances)
+        descents = LossDescents(
+            problem, measured, lower=lower, upper=upper, typical=typical, evaluated=resumed.evaluated
+        )  # fmt: skip
+        with observer(dependencies, lens_at) as seen:
+
+            def each(cycle: Cycle, x: np.ndarray) -> None:
+                seen.after_cycle(cycle, x, evaluated=descents.function.evaluated)
+
+            reached = descents.run(
+                np.clip(model.start, lower, upper), first=first is not None, restarts=restarts, cycles=cycles,
+                until=until, watch=each,
+            )  # fmt: skip
+            seen.write(
+                reached.x, reached.report.end, len(reached.history), evaluated=descents.function.evaluated, now=True
+            )  # fmt: skip
+        end = lens_at(reached.x)
+        result = _optimized(
+            lens, end, model, reached.x, reached.history, merits=(reached.report.start, reached.report.end),
+            cycles=reached.cycles, evaluations=reached.evaluations, stopped=reached.stopped,
+            seconds=time.monotonic() - started, loss=reached.report,
+            conditions=_attained(problem, problem.evaluated(reached.x), reached.x, lower=lower, upper=upper),
+        )  # fmt: skip
+        return _warned(result)
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
     seconds_of_end = time.monotonic() - evaluating
@@ -210,9 +224,7 @@ def optimize(
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
     x, count = descent.state.x, len(problem.rows)
     after = problem.evaluated(x)
-    results = attained(problem, after)
-    if not all(result.met for result in results):
-        results = with_reasons(results, problem, x, lower=lower, upper=upper)
+    results = _attained(problem, after, x, lower=lower, upper=upper)
     end = lens_at(x)
     result = _optimized(
         lens, end, problem.model, x, descent.history, rows=problem.rows,
@@ -226,6 +238,16 @@ def optimize(
         as_built=None if term is None else AsBuiltChange.of(term, lens, end),
     )  # fmt: skip
     return _warned(result)
+
+
+def _attained(
+    problem: Problem, evaluated: Evaluated, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray
+) -> tuple[Attained, ...]:
+    """Targets and attained values of conditions and boundaries, with the reason where one is not met."""
+    results = attained(problem, evaluated)
+    if not all(result.met for result in results):
+        results = with_reasons(results, problem, x, lower=lower, upper=upper)
+    return tuple(results)
 
 
 class _Observer:

@@ -15,6 +15,7 @@ from raytrace.maths.result import Column, Columns, Result, Table, number, plain,
 from raytrace.optimization.attained import Attained
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.glass_choice import GlassStep
+from raytrace.optimization.loss import LossReport
 from raytrace.optimization.merit import configurations_of
 from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.table import OPERANDS
@@ -72,7 +73,7 @@ class Optimized(Result):
     largest violation of a condition, step, damping and seconds of every cycle of the last descent. cycles, evaluations,
     seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
     glasses were chosen. conditions: targets and values reached of conditions and boundaries. as_built: spots of the
-    lens as built, if it is a term of the merit, which then includes it.
+    lens as built, if it is a term of the merit, which then includes it. loss: the way of a loss, in the place of rows.
     """
 
     lens: Lens
@@ -95,6 +96,7 @@ class Optimized(Result):
     glasses: tuple[GlassStep, ...] = ()
     conditions: tuple[Attained, ...] = ()
     as_built: AsBuiltChange | None = None
+    loss: LossReport | None = None
 
     def draw(self, **options: Any) -> "Figure":
         """One page: lens, spots and merit function before and after."""
@@ -163,6 +165,7 @@ class Optimized(Result):
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
                 **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
+                **({"loss": dataclasses.asdict(self.loss)} if self.loss else {}),
                 "conditions": [condition.document() for condition in self.conditions],
             }
         )
@@ -176,6 +179,7 @@ class Optimized(Result):
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             *([f"  {self.as_built}"] if self.as_built else []),
+            *([f"  {line}" for line in self.loss.lines()] if self.loss else []),
             *self._unsharp_start(),
             "",
         ]

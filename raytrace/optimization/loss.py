@@ -1,0 +1,198 @@
+"""A loss of a lens: spots first, then the loss by lifted least squares, restarts, and a check by denser rays."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import value
+from raytrace.optimization.least_squares import Cycle, CycleStart, Descent, least_squares
+from raytrace.optimization.lifted import Lifted, descend
+from raytrace.optimization.opening import opened
+from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem
+from raytrace.optimization.quantities import Quantity
+from raytrace.system.lens import Lens
+from raytrace.words import option
+
+_MOVED = 0.02  # relative change of a loss by denser rays, with which the descent goes on
+_ROUNDS = 3  # of denser rays
+_UNLIMITED = 300  # cycles of a descent without other limits
+_FIRST = 100  # cycles of the rows that are minimised first
+
+#: Invoked after each cycle with its report and the variables (n,).
+Watch: TypeAlias = Callable[[Cycle, np.ndarray], object]
+
+
+@dataclasses.dataclass(frozen=True)
+class Loss:
+    """A function () of a lens, or of a quantity of it at object distances (D,)."""
+
+    function: Callable[..., Tensor]
+    quantity: Quantity | None = None
+    object_distances: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls, function: Callable[..., Tensor], quantity: Quantity | None, object_distances: Sequence[float] | None
+    ) -> "Loss":
+        """Raises NoProblem for distances of a function of the lens itself."""
+        if object_distances is None:
+            return cls(function, quantity)
+        if quantity is None:
+            raise NoProblem(
+                f"{option('object_distances')} goes with a quantity, as {option('of', 'points')}: a function of the "
+                "lens moves the object itself, by lens.at(object_distance=…)"
+            )
+        return cls(function, quantity, torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1))
+
+    def __call__(self, lens: Lens) -> Tensor:
+        return self.function(lens if self.quantity is None else self.quantity(lens, self.object_distances))
+
+    def denser(self) -> "Loss | None":
+        """The loss of the same quantity by more rays; None of a function of the lens itself, which has its own."""
+        return None if self.quantity is None else dataclasses.replace(self, quantity=self.quantity.denser())
+
+
+@value
+class LossReport:
+    """The way of a loss: at the start, where the rows end that were minimised first, at the end of every descent (from
+    there, then from displaced lenses), and of the end by the rays of the descent and by denser ones.
+
+    refined: the number of descents with more rays, because a check had moved the loss by more than 2 %.
+    """
+
+    start: float
+    first: float
+    ends: tuple[float, ...]
+    end: float
+    checked: float
+    refined: int = 0
+
+    def lines(self) -> list[str]:
+        parts = [f"loss {self.start:.6g} at the start"]
+        parts += [] if np.isnan(self.first) else [f"{self.first:.6g} at the best spots"]
+        parts += [f"{end:.6g} after the descent" for end in self.ends[:1]]
+        parts += [f"{end:.6g} from a displaced lens" for end in self.ends[1:]]
+        lines = [", ".join(parts)]
+        if not np.isnan(self.checked):
+            more = f"; the descent went on with more rays {self.refined} times" if self.refined else ""
+            lines.append(f"by denser rays {self.checked:.6g}, by those of the descent {self.end:.6g}{more}")
+        return lines
+
+
+@dataclasses.dataclass(frozen=True)
+class LossDescent:
+    """The variables (n,) at the lowest loss, its cycles, the reason of its end and the way there."""
+
+    x: np.ndarray
+    history: tuple[Cycle, ...]
+    stopped: str
+    cycles: int
+    evaluations: int
+    report: LossReport
+
+
+class LossDescents:
+    """The descents of a loss over the variables of a problem, whose rows of rays are the metric, with its conditions.
+
+    evaluated: earlier evaluations, as of `FunctionMerit`; those by denser rays are not repeated.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        loss: Loss,
+        *,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        typical: np.ndarray,
+        evaluated: Iterable[np.ndarray] = (),
+    ):
+        self.problem, self.loss = problem, loss
+        self.lower, self.upper, self.typical = lower, upper, typical
+        self.function = FunctionMerit(problem.model, loss, evaluated)
+        self.history: list[Cycle] = []
+        self.most, self.until = 0, np.inf
+
+    def run(
+        self, start: np.ndarray, *, first: bool, restarts: int, cycles: int | None, until: float, watch: Watch
+    ) -> LossDescent:
+        """The descents of a run, from the start on.
+
+        first: whether the rows are minimised first; restarts: descents from displaced lenses; cycles: of the descents
+        of the loss together, by default 300 each. Raises NoProblem.
+        """
+        self.most, self.until = _UNLIMITED * (1 + restarts) if cycles is None else cycles, until
+        before, x, at_first, taken = self.function(start)[0], start, np.nan, 0
+        if first:
+            x, taken = self._at_best_rows(start)
+            at_first = self.function(x)[0]
+        if not np.isfinite(self.function(x)[0]):
+            place = "the best spots: rays of the loss fail there" if first else "the start: nothing to follow"
+            raise NoProblem(f"the loss is {self.function(x)[0]:g} at {place}")
+        best = self._descend(self.function, x, watch)
+        random, ends = np.random.default_rng(0), [_loss(best)]
+        for _ in range(restarts):
+            if self._is_over(best):
+                break
+            near = self._lifted(self.function).displaced(best.state.x, random)
+            near = np.clip(near, self.lower, self.upper)
+            if np.isfinite(self.function(near)[0]):
+                descent = self._descend(self.function, near, watch)
+                ends.append(_loss(descent))
+                best = descent if descent.state.is_better(best.state) else best
+        best, checked, refined, evaluations = self._checked(best, watch)
+        report = LossReport(before, at_first, tuple(ends), _loss(best), checked, refined)
+        cycles, evaluations = taken + len(self.history), evaluations + self.function.evaluations
+        return LossDescent(best.state.x, tuple(self.history), best.stopped, cycles, evaluations, report)
+
+    def _checked(self, best: Descent, watch: Watch) -> tuple[Descent, float, int, int]:
+        """A descent that goes on with denser rays as long as these move the loss; the loss by still denser ones, the
+        number of descents with denser rays, and evaluations by these."""
+        loss, checked, refined, evaluations = self.loss, np.nan, 0, 0
+        while (denser := loss.denser()) is not None:
+            function, loss = FunctionMerit(self.problem.model, denser), denser
+            checked = function(best.state.x)[0]
+            is_same = abs(checked - _loss(best)) <= _MOVED * abs(checked)
+            if is_same or self._is_over(best) or refined == _ROUNDS:
+                break
+            best, refined = self._descend(function, best.state.x, watch), refined + 1
+            evaluations += function.evaluations
+        return best, checked, refined, evaluations
+
+    def _is_over(self, descent: Descent) -> bool:
+        is_stopped = descent.stopped in ("seconds", "interrupted")
+        return is_stopped or len(self.history) >= self.most or time.monotonic() > self.until
+
+    def _at_best_rows(self, start: np.ndarray) -> tuple[np.ndarray, int]:
+        """Variables at the minimum of the rows, and cycles."""
+        lower, upper, typical, until = self.lower, self.upper, self.typical, self.until
+        opening = opened(self.problem, start, lower=lower, upper=upper, typical=typical, until=until)
+        descent = least_squares(
+            self.problem.state, opening.x, lower=lower, upper=upper, typical=typical, cycles=_FIRST, until=until
+        )
+        return descent.state.x, opening.cycles + len(descent.cycles)
+
+    def _lifted(self, function: FunctionMerit) -> Lifted:
+        return Lifted(function, self.problem.state, self.typical)
+
+    def _descend(self, function: FunctionMerit, x: np.ndarray, watch: Watch) -> Descent:
+        offset = len(self.history)
+
+        def each(cycle: Cycle, start: CycleStart) -> None:
+            cycle = dataclasses.replace(cycle, number=cycle.number + offset, evaluations=function.evaluations)
+            self.history.append(cycle)
+            watch(cycle, start.x)
+
+        return descend(
+            self._lifted(function), x, lower=self.lower, upper=self.upper, cycles=self.most - offset, until=self.until,
+            watch=each,
+        )  # fmt: skip
+
+
+def _loss(descent: Descent) -> float:
+    return descent.state.cost

@@ -1,0 +1,125 @@
+"""Quantities of a lens that a loss is a function of: landing points, kernels, transfer functions.
+
+    rt.optimize(lens, loss=lambda otf: (1 - otf.abs()).mean(), of="otf", vary="curvature thickness", hold="efl=100")
+
+A quantity is sampled by as many rays as its settings say, so that the loss is smooth in the numbers of the lens, and
+`denser` has more of them: a lens is never judged by the rays that it was optimised on alone.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Protocol, Self, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import value
+from raytrace.maths.sampling import equal_rings
+from raytrace.psf_models import model_of, psf
+from raytrace.system.lens import Lens, field_points, with_object_distance
+from raytrace.tracing.spot import image_rays
+from raytrace.tracing.trace import without_apertures
+from raytrace.words import did_you_mean, named_value, option
+
+_DENSER = 2  # times as many rings
+
+
+@runtime_checkable
+class Quantity(Protocol):
+    """A quantity of a lens at object distances (D,) mm; D = 1, its own one, without any."""
+
+    def __call__(self, lens: Lens, object_distances: Tensor | None) -> Tensor: ...
+
+    def denser(self) -> Self:
+        """The same quantity by more rays."""
+
+
+def _at_distances(lens: Lens, object_distances: Tensor | None) -> list[Lens]:
+    if object_distances is None:
+        return [lens]
+    return [with_object_distance(lens, distance) for distance in object_distances]
+
+
+@value
+class Points:
+    """Landing points (2, D, F, W, P) mm on the sensor, of object distances, fields, wavelengths and rays.
+
+    The P rays of `rings` rings share the light of the pupil equally. Apertures clip none of them, vignetting factors
+    count; rays that fail are nan. About the centroid of a field: points - points.mean((-2, -1), keepdim=True).
+    """
+
+    rings: int = 8
+
+    def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
+        pupil, _ = equal_rings(self.rings)
+        fields = field_points(None, like=lens)
+        traced = [
+            image_rays(without_apertures(at), pupil, fields=fields) for at in _at_distances(lens, object_distances)
+        ]
+        return torch.stack([torch.where(rays.valid, rays.position[:2], torch.nan) for rays in traced], 1)
+
+    def denser(self) -> "Points":
+        return Points(_DENSER * self.rings)
+
+
+@value
+class Otf:
+    """Geometric transfer functions (D, F, W, 2, V), complex, of patterns along y (tangential) and x (sagittal).
+
+    frequencies: (V,) cycles/mm on the sensor; about the centroid of all wavelengths of a field; rings: as of `Points`.
+    The geometric transfer function neglects diffraction.
+    """
+
+    frequencies: Sequence[float] = (10.0, 20.0, 40.0, 80.0)
+    rings: int = 8
+
+    def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
+        points = Points(self.rings)(lens, object_distances)
+        about = (points - points.mean((-2, -1), keepdim=True)).flip(0).movedim(0, -2)  # (D, F, W, 2, P), y first
+        phase = -2 * np.pi * about[..., None, :] * about.new_tensor(self.frequencies)[:, None]
+        return torch.polar(torch.ones_like(phase), phase).mean(-1)
+
+    def denser(self) -> "Otf":
+        return dataclasses.replace(self, rings=_DENSER * self.rings)
+
+
+@value
+class Kernels:
+    """PSFs (D, F, W, pixels, pixels) on pixels about the chief ray, of energy 1 for all light of a wavelength.
+
+    model: "gaussian" or "drt"; pixel: mm; order: of the model, as of `psf`, fixed for a loss that is smooth.
+    """
+
+    model: str = "gaussian"
+    pixel: float = 0.005
+    pixels: int = 31
+    order: int = 5
+
+    def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
+        kernels = psf(
+            lens, model_of(self.model, order=self.order), object_distances=object_distances, pixel=self.pixel,
+            size=self.pixels, per_wavelength=True,
+        ).kernel  # fmt: skip
+        return kernels.reshape(-1, *kernels.shape[-4:])
+
+    def denser(self) -> "Kernels":
+        return dataclasses.replace(self, order=_DENSER * self.order)
+
+
+#: Quantities by the name of `of`.
+QUANTITIES = {"points": Points, "otf": Otf, "kernels": Kernels}
+
+
+def quantity_of(of: "str | Quantity") -> Quantity | None:
+    """The quantity of a name, None of "lens". Raises ValueError."""
+    if not isinstance(of, str):
+        if isinstance(of, Quantity):
+            return of
+        raise TypeError(f"{option('of')} is {named_value(of)}; expected a name, or a quantity as Points(rings=12)")
+    if of == "lens":
+        return None
+    if of not in QUANTITIES:
+        known = ("lens", *QUANTITIES)
+        raise ValueError(f"{option('of')} {of!r}: expected {', '.join(known)}{did_you_mean(of, known)}")
+    return QUANTITIES[of]()

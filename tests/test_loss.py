@@ -1,0 +1,175 @@
+"""Losses by lifted least squares: the solver, quantities, conditions, checks by denser rays, restarts."""
+
+import numpy as np
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace.io import read_lens
+from raytrace.optimization.least_squares import Sides, SumOfSquares
+from raytrace.optimization.lifted import Lifted, descend
+from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.quantities import Kernels, Otf, Points
+
+TRIPLET = read_lens("cooke_triplet")
+TRANSFER = Otf((10.0, 20.0, 40.0), rings=4)
+FEW = {"vary": "curvature:1-4 sensor", "restarts": 0}
+
+
+def mean_square(points):
+    return (points - points.mean((-2, -1), keepdim=True)).square().sum(0).mean()
+
+
+def low_contrast(otf):
+    return (1 - otf.abs()).mean()
+
+
+# -- the solver
+
+
+FREE = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf), "cycles": 100}
+
+
+def valley(x):
+    """Rosenbrock's function and its gradient."""
+    bend = x[1] - x[0] ** 2
+    return 100 * bend**2 + (1 - x[0]) ** 2, np.array([-400 * x[0] * bend - 2 * (1 - x[0]), 200 * bend])
+
+
+def rows(x, derivatives, held=None):
+    """Rays that land at x: a metric that knows nothing of the function."""
+    none = np.zeros((0, 2))
+    value, slope = (np.zeros(0), none) if held is None else held(x)
+    return SumOfSquares(x, x + 2.0, 0, Sides.none(2), value, np.zeros(0), np.eye(2), slope, none)
+
+
+def test_a_narrow_valley_is_followed_to_its_end():
+    evaluations = []
+
+    def counted(x):
+        evaluations.append(x)
+        return valley(x)
+
+    end = descend(Lifted(counted, rows, np.ones(2)), np.array([-1.2, 1.0]), **FREE)
+    assert end.state.x == pytest.approx([1.0, 1.0], abs=1e-5)
+    assert end.state.merit < 1e-10
+    assert len(evaluations) < 200
+
+
+def test_an_equality_that_is_curved_is_met_at_the_minimum():
+    """On the circle x² + y² = 1 Rosenbrock's function has its minimum at (0.7864, 0.6177), by Lagrange's conditions."""
+
+    def circle(x):
+        return np.array([x @ x - 1.0]), 2 * x[None, :]
+
+    end = descend(
+        Lifted(valley, lambda x, derivatives: rows(x, derivatives, circle), np.ones(2)), np.array([0.1, 0.9]), **FREE
+    )
+    assert end.state.x == pytest.approx([0.78641515, 0.61769831], abs=1e-6)
+    assert abs(end.state.held[0]) < 1e-9
+
+
+# -- losses of a lens
+
+
+def test_a_mean_square_spot_as_a_loss_ends_where_its_rows_do():
+    by_rows = rt.optimize(TRIPLET, merit="spot", vary="curvature:1-4 sensor", hold="efl=100")
+    by_loss = rt.optimize(TRIPLET, loss=mean_square, of=Points(6), first=None, hold="efl=100", **FEW)
+    radii = [rt.spot(result.lens).rms_radius.square().mean().sqrt() for result in (by_rows, by_loss)]
+    assert float(radii[1]) == pytest.approx(float(radii[0]), rel=2e-3)
+    assert float(rt.first_order(by_loss.lens).effective_focal_length) == pytest.approx(100, abs=1e-6)
+    assert by_loss.conditions[0].met
+    assert by_loss.merit_after == pytest.approx(float(mean_square(Points(6)(by_loss.lens))), rel=1e-9)
+    assert by_loss.merit_before == pytest.approx(float(mean_square(Points(6)(TRIPLET))), rel=1e-9)
+
+
+@pytest.mark.parametrize("scale", [2.0**-30])
+def test_the_end_does_not_depend_on_the_scale_of_the_loss(scale):
+    ends = [
+        rt.optimize(TRIPLET, loss=lambda otf, k=k: k * low_contrast(otf), of=TRANSFER, cycles=4, **FEW).variables_after
+        for k in (1.0, scale)
+    ]
+    assert torch.allclose(*ends, rtol=1e-12, atol=0)
+
+
+def test_a_loss_beyond_the_best_spots_is_lower_than_at_the_best_spots():
+    result = rt.optimize(TRIPLET, loss=low_contrast, of=TRANSFER, hold="efl=100", cycles=15, **FEW)
+    way = result.loss
+    assert way.end < way.first < way.start
+    assert float(low_contrast(TRANSFER(result.lens))) == pytest.approx(way.end, rel=1e-9)
+    assert float(low_contrast(TRANSFER.denser()(result.lens))) == pytest.approx(way.checked, rel=1e-9)
+    assert f"{way.first:.6g} at the best spots" in str(result)
+    assert result.document()["loss"]["end"] == way.end
+    assert result.plot().axes
+
+
+@pytest.mark.slow
+def test_a_loss_of_too_few_rays_goes_on_with_more():
+    few = rt.optimize(TRIPLET, loss=low_contrast, of=Otf(rings=1), cycles=80, **FEW)
+    assert few.loss.refined >= 1
+    assert abs(few.loss.checked - few.loss.end) <= 0.02 * few.loss.checked or few.loss.refined == 3
+    assert "with more rays" in str(few)
+
+
+def test_restarts_end_at_the_best_descent_and_repeat():
+    options = {**FEW, "restarts": 2, "cycles": 9}
+    first, second = (rt.optimize(TRIPLET, loss=low_contrast, of=TRANSFER, **options) for _ in range(2))
+    assert torch.equal(first.variables_after, second.variables_after)
+    assert first.loss.end == min(first.loss.ends)
+
+
+def test_boundaries_of_the_first_rows_are_met_exactly():
+    rows = rt.optimization.DefaultMerit("spot", glass_thickness=(3.5, 12.0))
+    result = rt.optimize(
+        TRIPLET,
+        loss=low_contrast,
+        of=TRANSFER,
+        first=rows,
+        vary="thickness:1,3,6 curvature:1-4 sensor",
+        restarts=0,
+        cycles=8,
+    )
+    glass = [float(result.lens.surfaces[k].thickness) for k in (1, 3, 6)]
+    assert min(glass) > 3.5 - 1e-6
+    assert max(glass) < 12.0 + 1e-6
+
+
+def test_several_object_distances_are_those_of_one_lens():
+    """The focal length of the lens is held, and the loss is the mean over the distances."""
+    distances, of = [2e3, 4e3, 1e5], Points(rings=4)
+    result = rt.optimize(TRIPLET, loss=mean_square, of=of, object_distances=distances, hold="efl=100", cycles=10, **FEW)
+    lenses = [result.lens.at(object_distance=distance) for distance in distances]
+    assert float(rt.first_order(result.lens).effective_focal_length) == pytest.approx(100, abs=1e-4)
+    alone = [float(mean_square(of(lens))) for lens in lenses]
+    assert result.loss.end == pytest.approx(sum(alone) / 3, rel=1e-9)
+
+
+def test_quantities_have_the_axes_that_their_docstrings_say():
+    distances = torch.tensor([2e3, 1e5], dtype=torch.float64)
+    points, otf = Points(rings=5)(TRIPLET, distances), Otf((20.0,), rings=5)(TRIPLET, distances)
+    assert points.shape == (2, 2, 3, 3, 50)
+    assert otf.shape == (2, 3, 3, 2, 1)
+    kernels = Kernels(pixels=15)(TRIPLET, distances)
+    assert kernels.shape == (2, 3, 3, 15, 15)
+    assert bool((kernels.sum((-2, -1)) <= 1 + 1e-9).all())
+
+
+@pytest.mark.parametrize("field", [0, 1])
+def test_transfer_functions_of_rays_are_the_geometric_mtf(field):
+    lens = TRIPLET.at(wavelengths=[0.5876])
+    curves = rt.mtf(lens, frequencies=[10.0, 20.0], geometric=True)
+    otf = Otf((10.0, 20.0), rings=24)(lens).abs()[0, field, 0]
+    for direction, curve in zip(otf, (curves.tangential, curves.sagittal), strict=True):
+        assert torch.allclose(direction, curve[field].reshape(-1)[-2:], atol=2e-3)
+
+
+def test_what_goes_with_rows_alone_is_refused():
+    for given, words in (
+        ({"vary": "sensor glass:1"}, "goes with a merit of rows"),
+        ({"of": "lens", "object_distances": [1e3]}, "goes with a quantity"),
+        ({"merit": mean_square}, "give one of them"),
+    ):
+        with pytest.raises(NoProblem, match=words):
+            rt.optimize(TRIPLET, **{"loss": mean_square, "vary": "sensor", **given})
+    with pytest.raises(ValueError, match="did you mean points"):
+        rt.optimize(TRIPLET, loss=mean_square, of="point", vary="sensor")
