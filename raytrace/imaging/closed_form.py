@@ -12,6 +12,7 @@ from torch import Tensor
 
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.image import decoded, transfer_functions
+from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.pictures import Pictures, crop
 from raytrace.imaging.restoration import (
     cross_spectrum,
@@ -24,15 +25,12 @@ from raytrace.imaging.restoration import (
 from raytrace.imaging.variables import Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
-from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
+from raytrace.optimization.least_squares import TensorDescent
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import image_rays
 
-#: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
-#: lands beyond the next optimum, where a window holds only the middle of a blur.
-_FIRST_STEP = 0.02
 #: Sensor distances of a scan, by model; models of a single focus have one optimum, and Gaussians seldom two.
 _SCANNED = {"gaussian": 17, "drt": 81}  # 16 µm apart for the double Gauss at F/3
 _SETTLED = 1e-6  # relative decrease of the error below which a descent has ended
@@ -125,7 +123,7 @@ def optimise_closed_form(
 ) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
-    By L-BFGS-B with exact gradients (scipy). steps: at most so many iterations, by default until it has settled.
+    By steps of second order (`lens_steps`). steps: at most so many, by default until it has settled.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, parts = camera.variables, []
@@ -135,17 +133,10 @@ def optimise_closed_form(
         parts.append((float(error.detach()), float(penalty.detach())))
         return error + penalty
 
-    bounds = []
-    for variable in variables.variables:
-        ends = variables.bounds.get(variable.name, (-math.inf, math.inf))
-        low, high = sorted((end - variable.start) / variable.unit for end in ends)
-        bounds.append((low, high))
+    steps_of_lens = LensSteps(variables)
 
     def descend() -> TensorDescent:
-        # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-        most = {} if steps is None else {"steps": steps}
-        parameters = list(variables.parameters())
-        return minimise_tensors(parameters, loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11, **most)
+        return steps_of_lens.minimise(loss, **({} if steps is None else {"cycles": steps}))
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.

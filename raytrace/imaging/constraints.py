@@ -34,7 +34,7 @@ _MET = 1e-8  # violation that is met, in units of the conditions, as mm
 _PUPIL = ((0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0))  # rays of every field that must arrive
 
 #: x (n,), whether derivatives are requested -> excess (K,) over limits and its derivatives (K, n), or None.
-Limits = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray | None]]
+FurtherLimits = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray | None]]
 
 
 class GlassLimits:
@@ -76,7 +76,7 @@ class GlassLimits:
         return {surface: self.pool.glasses[int(np.argmin(squares))] for surface, squares in distance.items()}
 
 
-def joined_limits(limits: Sequence[Limits]) -> Limits | None:
+def joined_limits(limits: Sequence[FurtherLimits]) -> FurtherLimits | None:
     """All of several limits; None of none."""
     if not limits:
         return None
@@ -86,6 +86,17 @@ def joined_limits(limits: Sequence[Limits]) -> Limits | None:
         return np.concatenate(excess), np.concatenate(slopes) if derivatives else None
 
     return joined
+
+
+def with_limits(state: SumOfSquares, limits: FurtherLimits | None, x: np.ndarray, *, derivatives: bool) -> SumOfSquares:
+    """The state of a problem with further limits."""
+    if limits is None:
+        return state
+    excess, slope = limits(x, derivatives)
+    state = dataclasses.replace(state, limits=np.concatenate([state.limits, excess]))
+    if slope is None:
+        return state
+    return dataclasses.replace(state, limits_slope=np.concatenate([state.limits_slope, slope]))
 
 
 class Constraints:
@@ -102,7 +113,7 @@ class Constraints:
         unit: np.ndarray,
         lower: np.ndarray,
         upper: np.ndarray,
-        limits: Limits | None = None,
+        limits: FurtherLimits | None = None,
     ):
         self.problem = Problem(design, [*_rays(design.lens)], conditions)
         self.conditions, self.limits = tuple(conditions), limits
@@ -157,14 +168,7 @@ class Constraints:
         return before + arrives * (x - before)
 
     def _state(self, x: np.ndarray, *, derivatives: bool) -> SumOfSquares:
-        state = self.problem.state(x, derivatives)
-        if self.limits is None:
-            return state
-        excess, slope = self.limits(x, derivatives)
-        state = dataclasses.replace(state, limits=np.concatenate([state.limits, excess]))
-        if not derivatives:
-            return state
-        return dataclasses.replace(state, limits_slope=np.concatenate([state.limits_slope, slope]))
+        return with_limits(self.problem.state(x, derivatives), self.limits, x, derivatives=derivatives)
 
     def _linear(self, x: np.ndarray, wanted: np.ndarray) -> Linear:
         """The quadratic program at x, in which failed rays miss by less than nothing."""

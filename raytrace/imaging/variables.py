@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from raytrace.imaging.constraints import Constraints, GlassLimits, joined_limits
+from raytrace.imaging.constraints import Constraints, FurtherLimits, GlassLimits, joined_limits
 from raytrace.io import as_lens
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import safe_divide, to
@@ -316,7 +316,7 @@ class Variables(Owned):
         ends = zip(self.names, lower.tolist(), upper.tolist(), strict=True)
         self.bounds = {name: (low, high) for name, low, high in ends if low > -math.inf or high < math.inf}
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
-        self._held_to = self._conditions()
+        self.held_to = self._conditions()
         if "catalog" in self.conditions:
             self._glasses  # noqa: B018 - refuses lenses whose glasses do not vary
         for variable in self.variables:
@@ -337,7 +337,7 @@ class Variables(Owned):
         pupil, weights = gauss_rings(*_BLUR_RAYS, dtype=like.dtype, device=like.device)
         units = torch.diag(like.new_tensor([variable.unit for variable in self.variables]))
         with torch.enable_grad():
-            lens = self._free.lens_at(with_tangents(self._numbers(), units), self._modelled)
+            lens = self.free.lens_at(with_tangents(self._numbers(), units), self._modelled)
             rays = image_rays(lens, pupil, fields=field_points(None, like=self.lens))
         moved, weight = tangents_of(rays.position, count)[:, :2], weights * rays.valid
         about = moved - safe_divide((weight * moved).sum(-1, keepdim=True), weight.sum(-1, keepdim=True))
@@ -392,7 +392,7 @@ class Variables(Owned):
         return abs(change) > _NEGLIGIBLE * abs(at_zero) and abs(bend) <= _NEGLIGIBLE * max(abs(at_zero), abs(at_two))
 
     @functools.cached_property
-    def _free(self) -> DesignVariables:
+    def free(self) -> DesignVariables:
         """The variables that are parameters, and the solve for the focal length."""
         if self.held is None:
             return self.design
@@ -407,7 +407,7 @@ class Variables(Owned):
 
     def forward(self) -> Lens:
         """The lens with the current values of its variables."""
-        return self._free.lens_at(self._numbers(), self._modelled)
+        return self.free.lens_at(self._numbers(), self._modelled)
 
     def _every(self) -> tuple[Variable, ...]:
         return self.variables if self.held is None else (*self.variables, self.held.by)
@@ -512,25 +512,30 @@ class Variables(Owned):
         """The conditions of `hold`, and rays that arrive; None where the sensor alone varies, or the aperture."""
         if not self.conditions and all(name in ("sensor", "aperture") for name in self.names):
             return None
-        limits = []
+        lower, upper = np.array([self.bounds.get(v.name, (-math.inf, math.inf)) for v in self.variables]).T
+        return Constraints(
+            self.free,
+            self.held_to,
+            unit=np.array([abs(variable.unit) for variable in self.variables]),
+            lower=lower,
+            upper=upper,
+            limits=self.further_limits,
+        )
+
+    @property
+    def further_limits(self) -> FurtherLimits | None:
+        """Limits of thicknesses, of the solved number and of glasses; None without any."""
+        limits: list[FurtherLimits] = []
         if "buildable" in self.conditions or self.held is not None:
             limits.append(self._excess)
         if "catalog" in self.conditions:
             limits.append(self._glasses)
-        lower, upper = np.array([self.bounds.get(v.name, (-math.inf, math.inf)) for v in self.variables]).T
-        return Constraints(
-            self._free,
-            self._held_to,
-            unit=np.array([abs(variable.unit) for variable in self.variables]),
-            lower=lower,
-            upper=upper,
-            limits=joined_limits(limits),
-        )
+        return joined_limits(limits)
 
     @functools.cached_property
     def _glasses(self) -> GlassLimits:
         """The model glasses and those of the catalogs. Raises BadVariables where no glass varies."""
-        numbers = self._free.variables
+        numbers = self.free.variables
         columns = [(n.surface, GLASS[n.quantity]) if n.quantity in GLASS else None for n in numbers]
         surfaces = dict.fromkeys(column[0] for column in columns if column is not None)
         if not surfaces:
@@ -554,7 +559,7 @@ class Variables(Owned):
         numbers = torch.tensor(x)
         with torch.set_grad_enabled(derivatives):
             numbers = with_tangents(numbers, torch.eye(len(x), dtype=numbers.dtype)) if derivatives else numbers
-            lens = self._free.lens_at(numbers)
+            lens = self.free.lens_at(numbers)
             each = [*_shortfalls(lens, self.limits)] if "buildable" in self.conditions else []
             each += self._solved_beyond(lens)
         excess = np.array([float(amount.detach()) for amount in each])

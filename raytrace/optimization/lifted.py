@@ -41,11 +41,12 @@ _PAIRS = 30  # of a step and a change of the gradient, that are kept
 _FIRST = 0.2  # of the RMS spot: blur of the first undamped step
 _FACTOR = 4.0  # by which c changes at most from one step to the next
 _POWELL = 0.2  # least curvature of a pair, relative to that of B
-_RIDGE = 1e-4  # of the blur by a variable alone: least blur of a step in which all compensate each other
+_RIDGE = 0.01  # of the blur by a variable alone: least blur of a step whose parts compensate each other
 _LEAST = 1e-8  # eigenvalue of B relative to the largest
 _AGAIN = 1e-3  # relative decrease of the loss by a descent after which another one without pairs begins
 _JUMP = 0.4  # of the RMS spot: blur of the displacement of a restart
-_OPTIONS = SolverOptions(bends=False)
+#: Options of the solver: the residuals are a model without a second derivative along a step.
+OPTIONS = SolverOptions(bends=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +208,7 @@ def descend(
 
         before = lifted.function(x)[0]
         descent = least_squares(
-            lifted.state, x, lower=lower, upper=upper, typical=lifted.typical, options=_OPTIONS,
+            lifted.state, x, lower=lower, upper=upper, typical=lifted.typical, options=OPTIONS,
             cycles=cycles - len(history), until=until, watch=each,
         )  # fmt: skip
         history, evaluations = (*history, *map(counted, descent.cycles)), evaluations + descent.evaluations

@@ -1,0 +1,108 @@
+"""Steps of second order of the variables of a lens, for any loss of a camera.
+
+The loss is lifted into the rays of the lens (`optimization.lifted`): a step is one of damped least squares in the metric
+of the RMS blur, within the bounds and under the conditions of the variables, which it meets exactly.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.imaging.constraints import with_limits
+from raytrace.imaging.variables import Variables
+from raytrace.optimization.least_squares import Slope, SumOfSquares, TensorDescent, least_squares
+from raytrace.optimization.lifted import OPTIONS, Lifted, descend
+from raytrace.optimization.merit import DefaultMerit
+from raytrace.optimization.problem import Problem, typical_of
+
+
+class LensSteps:
+    """Steps of the parameters of `Variables`; those that need no gradient do not move."""
+
+    def __init__(self, variables: Variables):
+        self.variables, self.damping = variables, OPTIONS.damping
+        rows = DefaultMerit("spot").rows(variables.free.lens)
+        self.problem = Problem(variables.free, rows, variables.held_to)
+        self.typical = typical_of(variables.free)
+        self._values: list[float] = []
+        self._loss: Callable[[], Tensor] = lambda: torch.zeros(())
+        self._last: tuple[bytes, Slope] | None = None
+        self.lifted = Lifted(self._function, self._rows, self.typical)
+
+    @property
+    def parameters(self) -> list[torch.nn.Parameter]:
+        return [self.variables.get_parameter(variable.name) for variable in self.variables.variables]
+
+    def step(self, loss: Callable[[], Tensor]) -> float:
+        """Take a step that lowers a loss, a function without arguments of the current lens; its value before the step.
+
+        The loss of every call may be another one, as of another batch of pictures: only changes of the gradient within
+        a call tell its curvature.
+        """
+        self._begin(loss)
+        descent = least_squares(
+            self.lifted.state, self._numbers(), **self._ends(), typical=self.typical, cycles=1,
+            options=dataclasses.replace(OPTIONS, damping=self.damping),
+        )  # fmt: skip
+        self.damping = descent.cycles[-1].damping if descent.cycles else OPTIONS.damping
+        self._put(descent.state.x)
+        return self._values[0]
+
+    def minimise(self, loss: Callable[[], Tensor], *, cycles: int = 300) -> TensorDescent:
+        """Descend to the minimum of a loss, a function without arguments of the current lens."""
+        self._begin(loss)
+        start = self._numbers()
+        is_flat = not self._function(start)[1].any()
+        ends = self._ends()
+        descent = descend(self.lifted, start, **ends, cycles=0 if is_flat else cycles)
+        x, gradient = descent.state.x, self._function(descent.state.x)[1]
+        self._put(x)
+        reached = np.where(gradient > 0, ends["lower"], ends["upper"])
+        at_end = (gradient != 0) & np.isclose(x, reached, rtol=1e-9, atol=1e-9)
+        return TensorDescent((*self._values, descent.state.cost), tuple(at_end.tolist()), is_flat)
+
+    def _begin(self, loss: Callable[[], Tensor]) -> None:
+        self._loss, self._last = loss, None
+        self._values.clear()
+
+    @torch.no_grad()
+    def _numbers(self) -> np.ndarray:
+        pairs = zip(self.variables.variables, self.parameters, strict=True)
+        return np.array([variable.start + variable.unit * float(parameter) for variable, parameter in pairs])
+
+    @torch.no_grad()
+    def _put(self, x: np.ndarray) -> None:
+        for variable, parameter, number in zip(self.variables.variables, self.parameters, x, strict=True):
+            parameter.fill_((number - variable.start) / variable.unit)
+
+    def _ends(self) -> dict[str, np.ndarray]:
+        """Bounds of the numbers."""
+        x, free = self._numbers(), np.array([parameter.requires_grad for parameter in self.parameters])
+        names = [variable.name for variable in self.variables.variables]
+        lower, upper = np.array([self.variables.bounds.get(name, (-math.inf, math.inf)) for name in names]).T
+        return {"lower": np.where(free, lower, x), "upper": np.where(free, upper, x)}
+
+    def _function(self, x: np.ndarray) -> Slope:
+        """The loss and its gradient by the numbers."""
+        if self._last is not None and self._last[0] == x.tobytes():
+            return self._last[1]
+        self._put(x)
+        moved = [parameter for parameter in self.parameters if parameter.requires_grad]
+        with torch.enable_grad():
+            loss = self._loss()
+        by = torch.autograd.grad(loss, moved, materialize_grads=True) if loss.requires_grad else None
+        gradient, each = np.zeros(len(x)), iter(by or [])
+        for k, (variable, parameter) in enumerate(zip(self.variables.variables, self.parameters, strict=True)):
+            if by is not None and parameter.requires_grad:
+                gradient[k] = float(next(each)) / variable.unit
+        self._values.append(float(loss.detach()))
+        self._last = x.tobytes(), (self._values[-1], gradient)
+        return self._last[1]
+
+    def _rows(self, x: np.ndarray, derivatives: bool) -> SumOfSquares:
+        state = self.problem.state(x, derivatives)
+        return with_limits(state, self.variables.further_limits, x, derivatives=derivatives)
