@@ -17,7 +17,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -332,7 +332,9 @@ class ElementKernels:
     """Kernels of elements alone, the same at every place of the sensor, as `FieldKernels` of a lens.
 
     lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
-    plan: the sampling, of an earlier call: for loops; memo: of sums that do not depend on the heights.
+    exact: the true spheres instead of Fresnel's paraboloids; normalise: "window", kernels of sum 1, or "energy", of the
+    share of the light through the aperture; plan: the sampling, of an earlier call: for loops; memo: of sums that do
+    not depend on the heights.
     """
 
     lens: Lens
@@ -341,6 +343,8 @@ class ElementKernels:
     size: int
     object_distances: Tensor
     weights: Tensor
+    exact: bool = False
+    normalise: Literal["window", "energy"] = "window"
     plan: Plan | None = None
     memo: Memo | None = None
 
@@ -348,7 +352,8 @@ class ElementKernels:
     def scene(self) -> WaveScene:
         sensor_distance = self.lens.surfaces[-2].thickness
         window = make_grid(sensor_distance.new_tensor(self.sensor.pitch), self.size)
-        return WaveScene(self.elements, sensor_distance, self.object_distances, self.lens.wavelengths, window)
+        wavelengths = self.lens.wavelengths
+        return WaveScene(self.elements, sensor_distance, self.object_distances, wavelengths, window, self.exact)
 
     def light(self) -> Tensor:
         """Light (D, W, h, w) in each pixel, columns towards +x; 1 = all through the aperture."""
@@ -360,9 +365,9 @@ class ElementKernels:
         return light.sum((-2, -1)) @ self.weights.to(light).T
 
     def of_light(self, light: Tensor) -> Tensor:
-        """Kernels (D, C, size, size) of sum 1 of `light`."""
+        """Kernels (D, C, size, size) of `light`."""
         kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
-        return _of_sum_1(kernels)
+        return kernels if self.normalise == "energy" else _of_sum_1(kernels)
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
@@ -372,7 +377,7 @@ class ElementKernels:
     def paired(self, points: Tensor) -> Tensor:
         """Kernels (N, C, size, size) of pairs: places (2, N) mm, each with its object distance of (N,)."""
         distances, which = _distinct(self.object_distances)
-        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
+        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0].index_select(0, which)
 
     def of_pairs(self, fields: Tensor) -> Tensor:
         """`paired` of field points (2, N)."""
@@ -416,19 +421,13 @@ def field_kernels(
     weights: Tensor,
     lateral_colour: bool = True,
     elements: Sequence[Element] = (),
-    **more: Any,
 ) -> FieldKernels | ElementKernels:
-    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone.
-
-    more: further fields of `FieldKernels`.
-    """
+    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone."""
     elements = tuple(elements)
     if elements and is_stop_alone(lens):
         check_model(model, elements)
         return ElementKernels(lens, elements, sensor, size, object_distances, weights)
-    return FieldKernels(
-        lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements, **more
-    )
+    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements)
 
 
 def has_points(parameters: Model | None) -> bool:
