@@ -22,7 +22,7 @@ from raytrace.imaging.restoration import (
 from raytrace.imaging.training import SCHEDULES, OtherSettings
 from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import WaveCameraConfig, best_gamma, mirrored, periodic, quality, transfer
-from raytrace.imaging.wave_design import begin, best_of_starts, expected_error, learn_element, radial_powers
+from raytrace.imaging.wave_design import Design, radial_powers
 from raytrace.materials.glass import index
 from raytrace.maths.zernike import polynomials
 from raytrace.settings import DesignSettings
@@ -103,11 +103,9 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     powers[:1] = lens.profile.coefficients
     smooth = Element(EvenPowers(powers), lens.radius, lens.glass)
     before, watched = error_of([smooth]), []
-    best = best_of_starts(
+    design = Design(dataclasses.replace(QUICK, starts=2, spread=0.3, start_steps=30), SMALL, S)
+    best = design.best_of_starts(
         lambda: PhaseVariables(smooth, basis=radial_powers(smooth.radius, 5)),
-        dataclasses.replace(QUICK, starts=2, spread=0.3, start_steps=30),
-        SMALL,
-        S,
         watch=lambda *report: watched.append(report),
     )
     after = error_of(best())
@@ -134,8 +132,9 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
     ends = []
     for name, stop in (("whole", None), ("broken", 7)):
         for _ in range(1 if stop is None else 2):
-            camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
-            for step, _record in learn_element(camera, SMALL, LEAVES, settings, run, every=5):
+            design = Design(settings, SMALL, S)
+            camera, run = design.begin(tmp_path / name, pictures=OF_LEAVES)
+            for step, _record in design.learn(camera, LEAVES, run, every=5):
                 if step == stop:
                     stop = None
                     break
@@ -143,14 +142,14 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
         assert [row["step"] for row in run.rows()] == list(range(settings.steps))
     assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
     with pytest.raises(OtherSettings, match="rate was"):
-        begin(dataclasses.replace(settings, rate=0.01), SMALL, S, tmp_path / "whole", pictures=OF_LEAVES)
+        Design(dataclasses.replace(settings, rate=0.01), SMALL, S).begin(tmp_path / "whole", pictures=OF_LEAVES)
 
 
 def test_a_run_is_that_of_its_pictures(tmp_path):
     """As many others are refused, whether it has finished or not."""
     settings, others = dataclasses.replace(QUICK, steps=1), dead_leaves(8, size=64, seed=6, smallest=2.5)
-    initial, _ = learn(settings, SMALL, LEAVES, tmp_path, "finished")
-    before, after = learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    _, initial, _ = learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    _, before, after = learn(settings, SMALL, LEAVES, tmp_path, "finished")
     assert torch.equal(before.elements()[0].numbers, initial.elements()[0].numbers)
     assert not torch.equal(after.elements()[0].numbers, initial.elements()[0].numbers)
     for _ in range(2):
@@ -163,10 +162,11 @@ def test_a_run_is_that_of_its_pictures(tmp_path):
 def test_pictures_teach_the_filter_of_the_original(tmp_path):
     """Weight and target depth move with the heights, and the loss of the same draws falls."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="towards", steps=25, batch=4)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
     filter = camera.filter
     first = [float(filter.v), float(filter.t), camera.variables.change.detach().clone()]
-    losses = [record["loss"] for _, record in learn_element(camera, SMALL, LEAVES, settings, run)]
+    losses = [record["loss"] for _, record in design.learn(camera, LEAVES, run)]
     assert float(filter.v) != first[0]
     assert float(filter.t) != first[1]
     assert not torch.equal(camera.variables.change, first[2])
@@ -176,14 +176,15 @@ def test_pictures_teach_the_filter_of_the_original(tmp_path):
 def test_a_network_learns_behind_the_filter(tmp_path):
     """It begins as nothing at all, and both it and the element move."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="network", steps=4, batch=2)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
     with torch.no_grad():
         both = camera(PICTURES[:2], [500.0, math.inf], index=[0, 1])
         alone, network = SMALL.camera(camera.variables, filter=camera.filter), camera.network
         alone.plan(SMALL.depths)
         torch.testing.assert_close(both, alone(PICTURES[:2], [500.0, math.inf], index=[0, 1]), atol=1e-6, rtol=0)
     before = [p.detach().clone() for p in (network.decoder[-1].weight, camera.variables.change)]
-    for _ in learn_element(camera, SMALL, LEAVES, settings, run):
+    for _ in design.learn(camera, LEAVES, run):
         pass
     for old, new in zip(before, (network.decoder[-1].weight, camera.variables.change), strict=True):
         assert not torch.equal(old, new)
@@ -194,11 +195,12 @@ def test_every_kind_of_element_is_learned(tmp_path, kind, levels):
     settings = dataclasses.replace(
         QUICK, kind=kind, levels=levels, terms=11 if kind == "zernike" else 4, pitch=0.02, steps=6, spread=0.05
     )
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
-    before = expected_error(camera, SMALL)
-    for _ in learn_element(camera, SMALL, LEAVES, settings, run):
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
+    before = design.expected_error(camera)
+    for _ in design.learn(camera, LEAVES, run):
         pass
-    after = expected_error(camera, SMALL)
+    after = design.expected_error(camera)
     assert after < before
     (element, *_) = camera.variables()
     if levels:
@@ -245,14 +247,15 @@ def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):
     losses = {}
     for name, change in {"off": {"tolerance": 0.0}, "on": {}, "again": {}, "seed": {"seed": 1}}.items():
         settings = dataclasses.replace(still, **change)
-        camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
-        losses[name] = [record["loss"] for _, record in learn_element(camera, SMALL, LEAVES, settings, run)]
+        design = Design(settings, SMALL, S)
+        camera, run = design.begin(tmp_path / name, pictures=OF_LEAVES)
+        losses[name] = [record["loss"] for _, record in design.learn(camera, LEAVES, run)]
     assert np.ptp(losses["off"]) < 1e-9 * losses["off"][0]
     assert len(set(losses["on"])) == 4
     assert losses["again"] == losses["on"]
     assert not set(losses["seed"]) & set(losses["on"])
     with pytest.raises(ValueError, match="belongs to rings"):
-        begin(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S, tmp_path / "smooth", pictures=OF_LEAVES)
+        Design(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S).begin(tmp_path / "smooth", pictures=OF_LEAVES)
 
 
 def test_mirrored():
@@ -291,8 +294,9 @@ def test_the_order_that_was_published(tmp_path):
     content = Content("leaves", pictures[:8], pictures[8:])
     spectrum_ = power_spectrum(content.train, window="none")
     settings = DesignSettings(steps=60, starts=2)
-    camera, run = begin(settings, config, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
-    for _ in learn_element(camera, config, LEAVES, settings, run):
+    design = Design(settings, config, spectrum_)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
+    for _ in design.learn(camera, LEAVES, run):
         pass
     with torch.no_grad():
         learned = {"learned": camera.elements()}

@@ -168,7 +168,7 @@ def table_of(
     for name in progress(list(elements)):
         camera = config.camera(elements[name])
         with torch.no_grad():
-            how = {"design": config.design, "kernels": camera.kernels_over_field(config.depths)[:, 0]}
+            how = {"design": config.design, "kernels": camera.kernels(config.depths)}
         for content in contents:
             found[content.name][name] = quality(camera, config.depths, train=content.train, test=content.test, **how)
     return found
@@ -477,7 +477,7 @@ def _learned(
                 continue
             folder = Path(arguments.folder or unkept) / name
             with torch.enable_grad():
-                _, camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
+                *_, camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
             found[name] = camera.elements()
     return found
 
@@ -497,7 +497,7 @@ def figures(found, elements: Mapping[str, Sequence[Element]], config: WaveCamera
     made = {"depth.png": depth_figure(found, config)}
     for name in {"learned", "learned-smooth"} & set(elements):
         with torch.no_grad():
-            kernels = config.camera(elements[name]).kernels_over_field(config.depths)[:, 0]
+            kernels = config.camera(elements[name]).kernels(config.depths)
         report = ElementReport(elements[name], config, kernels, first[name])
         made[f"{name}.png"] = report.plot()
     scene = {name: elements[name] for name in _SHOWN if name in elements}

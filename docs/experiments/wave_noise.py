@@ -58,13 +58,14 @@ from raytrace.imaging.restoration import (
     wiener,
 )
 from raytrace.imaging.variables import PhaseVariables
-from raytrace.imaging.wave_camera import FILTERS, WAVELENGTH, WaveCameraConfig, best_gamma, transfer
-from raytrace.imaging.wave_design import expected_error
+from raytrace.imaging.wave_camera import FILTERS, WaveCameraConfig, best_gamma, transfer
+from raytrace.imaging.wave_design import Design
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import Result
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings
+from raytrace.wave_optics.compute import DESIGN
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Rings, is_flat
 from raytrace.wave_optics.element_files import SMOOTH, read_element, write_element
@@ -406,10 +407,10 @@ def _rows(asked: Sequence[str] | None) -> list[str]:
     return [name for name in ROWS if name in wanted]
 
 
-def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> Camera:
-    """The camera of a unit, learned as far as is left."""
+def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> tuple[Design, Camera, Camera]:
+    """The design of a unit, its initial camera and the one that is learned as far as is left."""
     label = f"{ROWS[unit.row].title}, noise {unit.noise:g}, start {unit.start}"
-    return learn(unit.settings(settings.steps), unit.config(), train, unit.folder(root), label)[1]
+    return learn(unit.settings(settings.steps), unit.config(), train, unit.folder(root), label)
 
 
 class Kept:
@@ -516,7 +517,7 @@ def _best_learned(
             best[unit.row, unit.noise] = unit
     found = {}
     for (row, own), unit in best.items():
-        element = detached(learn_unit(unit, settings, train, root).elements()[0])
+        element = detached(learn_unit(unit, settings, train, root)[-1].elements()[0])
         name, made = (".npy", fabricated(element)) if is_flat(element) else (SMOOTH, element)
         found[f"{row}-{own:g}{name}"] = made
     return found
@@ -527,11 +528,11 @@ def judge_learned(
 ) -> tuple[float, dict[str, Errors]]:
     """Its expected error, that of learning, and errors of pictures."""
     name = f"{unit.row}-{unit.noise:g}-{unit.start}"
-    camera = learn_unit(unit, settings, train, root)
+    design, _, camera = learn_unit(unit, settings, train, root)
     with torch.no_grad():
         elements = detached(camera.elements())
         found = kept.find(name, unit.config(), lambda: kept.transfer(elements))
-        return kept.store.number(name, lambda: expected_error(camera, unit.config())), found
+        return kept.store.number(name, lambda: design.expected_error(camera)), found
 
 
 def scores(
@@ -565,7 +566,7 @@ def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
     beside = docs / "wave" / "elements"
     beside.mkdir(parents=True, exist_ok=True)
     for name, element in elements.items():
-        write_element(element, beside / name, design_wavelength=WAVELENGTH)
+        write_element(element, beside / name, design_wavelength=DESIGN)
 
 
 def element_words(arguments: argparse.Namespace) -> list[str]:

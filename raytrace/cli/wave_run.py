@@ -21,7 +21,7 @@ from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.restoration import power_law, power_spectrum, psnr, restore
 from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import ElementReport, WaveCameraConfig, depth_text, periodic
-from raytrace.imaging.wave_design import begin, expected_error, learn_element
+from raytrace.imaging.wave_design import Design
 from raytrace.io.pictures import read_channels, write_picture
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import Column, Result, Table, plain
@@ -96,11 +96,11 @@ def design(arguments: argparse.Namespace) -> DesignedElement:
     label = f"{settings.kind}, seed {settings.seed}"
     with progress(None, what=f"{label}: training pictures"):
         train, test = split(training_pictures(arguments, "sharp leaves"))
-    cameras = learn(settings, config, train, folder, label)
+    design, *cameras = learn(settings, config, train, folder, label)
     pictures = {"train": periodic(train, WIDE), "test": periodic(test, WIDE)}
     bar = progress(cameras, "element", what=f"{label}: image quality")
     initial, after = (ElementReport.of(detached(camera.elements()), config, **pictures) for camera in bar)
-    before, designed_error = (expected_error(camera, config) for camera in cameras)
+    before, designed_error = map(design.expected_error, cameras)
     errors, parts = (before, designed_error), after.elements
     designed = DesignedElement(parts, config, after.kernels, after.quality, settings, errors, initial=initial)
     write_json(folder / "outcome.json", designed.document())
@@ -129,10 +129,11 @@ def _design_settings(arguments: argparse.Namespace) -> DesignSettings:
 
 def learn(
     settings: DesignSettings, config: WaveCameraConfig, train: Pictures, folder: Path, label: str
-) -> tuple[Camera[PhaseVariables], Camera[PhaseVariables]]:
-    """The initial and the optimised camera: the remaining steps of its run, with a bar."""
+) -> tuple[Design, Camera[PhaseVariables], Camera[PhaseVariables]]:
+    """The design, its initial and its optimised camera: the remaining steps of its run, with a bar."""
     with progress(None, what=f"{label}: spectrum of the pictures"):
         S, images = power_spectrum(periodic(train, settings.size), window="none"), digest(train.samples)
+    design = Design(settings, config, S)
     bars = []
 
     def starts(items: Iterable) -> Iterable:
@@ -143,13 +144,13 @@ def learn(
         bars[-1].set_postfix_str(f"start {start}: evaluation {evaluation}, error {error:.6f}", refresh=False)
 
     with progress(None, what=f"{label}: initial element"):
-        camera, run = begin(settings, config, S, folder, pictures=images, progress=starts, watch=watch)
+        camera, run = design.begin(folder, pictures=images, progress=starts, watch=watch)
         initial = copy.deepcopy(camera)
     with progress(None, what=f"{label}: compiling the trace"):
         prepare()
     record = None
     with progress(settings.steps, what=f"{label}: optimisation") as bar:
-        for step, record in learn_element(camera, config, train, settings, run):
+        for step, record in design.learn(camera, train, run):
             if bar.n < step:  # resumed
                 bar.n = bar.initial = step
             bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
@@ -158,7 +159,7 @@ def learn(
         say(f"{label}: finished before, nothing to learn")
     else:
         say(f"{label}: loss {record['loss']:.6f} after {settings.steps} steps")
-    return initial, camera
+    return design, initial, camera
 
 
 def training_pictures(arguments: argparse.Namespace, leaves: str) -> Pictures:

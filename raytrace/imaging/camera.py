@@ -37,7 +37,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
@@ -47,6 +47,7 @@ from raytrace.imaging.field_kernels import (
     ElementKernels,
     FieldKernels,
     Model,
+    Normalisation,
     by_angle,
     check_model,
     check_points,
@@ -136,7 +137,7 @@ class Camera(nn.Module, Generic[V]):
         fields: Tensor | Sequence | None = None,
         pixels: int = 21,
         center: Literal["chief", "centroid"] = "chief",
-        normalise: Literal["window", "energy", "haze"] = "window",
+        normalise: Normalisation = "window",
         boundary: Literal["valid", "circular", "zero", "reflect", "taper"] = "valid",
         illumination: bool = False,
         filter: LinearFilter | None = None,
@@ -199,7 +200,7 @@ class Camera(nn.Module, Generic[V]):
         check_model(self.model, self.elements())
         for name, word, known in (
             ("center", self.center, ("chief", "centroid")),
-            ("normalise", self.normalise, ("window", "energy", "haze")),
+            ("normalise", self.normalise, get_args(Normalisation)),
             ("boundary", self.boundary, BOUNDARIES),
         ):
             if word not in known:
@@ -339,11 +340,8 @@ class Camera(nn.Module, Generic[V]):
         distances, elements = self._distances(object_distances), self.elements(draw=draw)
         lens = element_in_stop(elements, self.sensor, self.sensor_distance, self.wavelengths)
         weights = self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
-        normalise: Literal["window", "energy"] = "window" if self.normalise == "window" else "energy"
-        return ElementKernels(
-            lens, elements, self.sensor, self.size, distances, weights, self.exact, normalise, self._sampling,
-            self._memo,
-        )  # fmt: skip
+        numbers = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
+        return ElementKernels(lens, elements, *numbers)
 
     def kernels(
         self,
@@ -384,7 +382,7 @@ class Camera(nn.Module, Generic[V]):
                 elements=self.elements(),
                 parameters=self.psf_parameters,
                 center=self.center,
-                normalise="energy" if self.normalise == "energy" else "window",
+                normalise=self.normalise,
                 memo=self._memo if points is None and errors is None else None,
             )
         if errors is None and points is not None:

@@ -55,6 +55,8 @@ from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
+#: Kernels of sum 1; or of the share of all light, of which the part beyond the window is lost, or returns as even haze.
+Normalisation: TypeAlias = Literal["window", "energy", "haze"]
 #: A PSF model with its numbers.
 Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
 
@@ -87,7 +89,7 @@ class FieldKernels:
     where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
     traced; elements: in contact at the stop, with the model "wave"; parameters: of the model, as Paraxial(rho=0.4), or
     Gaussian(rays=points), pupil points in place of an order; center: of the window, "chief" or "centroid" (of the
-    light); normalise: "window", kernels of sum 1, or "energy", of the share of the light through the entrance pupil;
+    light); normalise: "window", kernels of sum 1, or of the share of the light through the entrance pupil;
     memo: of rays, for loops over the same field points. Raises ValueError for elements and another model.
     """
 
@@ -103,7 +105,7 @@ class FieldKernels:
     elements: tuple[Element, ...] = ()
     parameters: Model | None = None
     center: Literal["chief", "centroid"] = "chief"
-    normalise: Literal["window", "energy"] = "window"
+    normalise: Normalisation = "window"
     memo: Memo | None = None
 
     def __post_init__(self) -> None:
@@ -219,7 +221,7 @@ class FieldKernels:
                 part = part.detach().requires_grad_()
             light = self.light(part, origin) if self.elements else self._of_model(part, origin)
             light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
-            kernels.append(light if self.normalise == "energy" else _of_sum_1(light))
+            kernels.append(_of_sum_1(light) if self.normalise == "window" else light)
         return torch.cat(kernels)
 
     def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
@@ -332,9 +334,8 @@ class ElementKernels:
     """Kernels of elements alone, the same at every place of the sensor, as `FieldKernels` of a lens.
 
     lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
-    exact: the true spheres instead of Fresnel's paraboloids; normalise: "window", kernels of sum 1, or "energy", of the
-    share of the light through the aperture; plan: the sampling, of an earlier call: for loops; memo: of sums that do
-    not depend on the heights.
+    exact: the true spheres instead of Fresnel's paraboloids; plan: the sampling, of an earlier call: for loops; memo:
+    of sums that do not depend on the heights.
     """
 
     lens: Lens
@@ -344,7 +345,7 @@ class ElementKernels:
     object_distances: Tensor
     weights: Tensor
     exact: bool = False
-    normalise: Literal["window", "energy"] = "window"
+    normalise: Normalisation = "window"
     plan: Plan | None = None
     memo: Memo | None = None
 
@@ -367,7 +368,7 @@ class ElementKernels:
     def of_light(self, light: Tensor) -> Tensor:
         """Kernels (D, C, size, size) of `light`."""
         kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
-        return kernels if self.normalise == "energy" else _of_sum_1(kernels)
+        return _of_sum_1(kernels) if self.normalise == "window" else kernels
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""

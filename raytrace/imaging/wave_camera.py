@@ -39,7 +39,6 @@ from raytrace.plotting.style import (
 from raytrace.wave_optics.element import Element, height
 
 FILTERS = ("wiener", "blind")  # of restoration
-WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
 _SIDE = 512  # pixels of the sensor along a side
 _BLACK = 1e-5  # of the brightest pixel of a row of kernels
 _TALL = 10.0  # µm of height, many waves, beyond which the texture is drawn as a difference
@@ -80,17 +79,10 @@ class WaveCameraConfig:
         if not isinstance(elements, PhaseVariables):
             first, *others = elements
             elements = PhaseVariables(first, others=others).requires_grad_(False)
-        numbers: dict[str, Any] = {
-            "sensor": self.sensor,
-            "sensor_distance": self.sensor_distance,
-            "wavelengths": self.wavelengths,
-            "exact": self.exact,
-            "object_distances": (min(self.depths), max(self.depths)),
-            "fields": [0],
-            "pixels": self.size,
-            "normalise": "haze",
-            "boundary": "circular",
-        }
+        optics = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "exact": self.exact}
+        window = {"pixels": self.size, "normalise": "haze", "boundary": "circular", "fields": [0]}
+        near_to_far = min(self.depths), max(self.depths)
+        numbers: dict[str, Any] = {"sensor": self.sensor, "object_distances": near_to_far} | optics | window
         return Camera(elements, network or nn.Identity(), **(numbers | options))
 
 
@@ -101,8 +93,7 @@ def depth_text(depth: float, infinity: str = "infinity") -> str:
 
 def transfer(camera: Camera, size: int, distances: Sequence[float]) -> Tensor:
     """H (D, C, size, size) of a camera at object distances (D,) mm in its first field, on periodic pictures."""
-    kernels = camera.kernels_over_field(distances)[:, 0]
-    return transfer_functions(camera.of_period(kernels, size), size)
+    return transfer_functions(camera.of_period(camera.kernels(distances), size), size)
 
 
 def periodic(pictures: Pictures, size: int) -> Tensor:
@@ -180,7 +171,7 @@ def quality(
 
     design: mm, the depth whose kernel the Wiener filter inverts; kernels: (D, C, h, w) of the camera, if known.
     """
-    kernels = camera.kernels_over_field(depths)[:, 0] if kernels is None else kernels
+    kernels = camera.kernels(depths) if kernels is None else kernels
     size, S = test.shape[-1], power_spectrum(train, window="none")
     H, noise = transfer_functions(camera.of_period(kernels, size), size), camera.sensor.noise_deviation(S)
     at_design = H[depths.index(design)] if design in depths else transfer(camera, size, [design])[0]
@@ -221,7 +212,7 @@ class ElementReport(Result):
         """Kernels and `quality` of elements."""
         camera = config.camera(elements)
         with torch.no_grad():
-            kernels = camera.kernels_over_field(config.depths)[:, 0]
+            kernels = camera.kernels(config.depths)
         rating = quality(camera, config.depths, design=config.design, train=train, test=test, kernels=kernels)
         return cls(elements, config, kernels, rating)
 
