@@ -18,7 +18,7 @@ from PIL import Image
 
 import raytrace as rt
 import raytrace.imaging.camera
-from raytrace.imaging.closed_form import camera_error, even_distances, field_filters, noise_deviation, patch_spectrum
+from raytrace.imaging.closed_form import camera_error, even_distances, field_filters, patch_spectrum
 from raytrace.imaging.codesign import (
     Batches,
     absolute_error,
@@ -374,7 +374,7 @@ def test_the_closed_form_is_over_fields_colours_and_distances(triplet, pictures)
         with torch.no_grad():
             one.variables.sensor -= shift
     assert float(slope) == pytest.approx((values[0] - values[1]) / 2e-3, rel=1e-3)
-    kernels, sigma = one.kernels_over_field(distances).detach(), noise_deviation(one, spectrum)
+    kernels, sigma = one.kernels_over_field(distances).detach(), one.sensor.noise_deviation(spectrum)
     assert sigma.flatten().tolist() == pytest.approx([0.02] * 3)
     single = [
         float(depth_invariant_error(transfer_functions(kernels[:, n, c], 26), spectrum[c], 0.02))

@@ -5,11 +5,15 @@ import math
 
 import pytest
 import torch
+from differences import gradcheck, gradgradcheck
 from problems import double_gauss, scalar
+from torch.func import functional_call
 
 import raytrace as rt
+from raytrace.imaging.closed_form import camera_error
 from raytrace.imaging.field_kernels import ElementKernels, FieldKernels
-from raytrace.imaging.image import blur_layers, depth_masks
+from raytrace.imaging.image import blur, blur_layers, depth_masks, with_haze
+from raytrace.imaging.octant import octant_error
 from raytrace.imaging.render import optics, patch_kernels, render_patches
 from raytrace.system.lens import with_sensor_distance
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
@@ -114,6 +118,7 @@ def singlet():
 def test_kernels_of_an_element_alone_are_those_of_wave_psf():
     lens = stop_alone(singlet(), sensor_distance=35.5, wavelengths=(0.46, 0.55, 0.64))
     assert is_stop_alone(lens)
+    assert lens.wavelengths.tolist() == [0.46, 0.55, 0.64]  # to the last digit
     assert not is_stop_alone(slow_gauss())
     points = torch.tensor([[0.0, 0.2], [0.0, -0.1]], dtype=torch.float64)
     depths = torch.tensor([500.0, 1000.0, math.inf], dtype=torch.float64)
@@ -192,6 +197,65 @@ def element_camera(**options):
     )
 
 
+def periodic_camera(**options):
+    """Of pictures of 24 × 24 pixels that are periods of endless ones, and the best filter for three depths."""
+    spectrum = rt.imaging.power_spectrum(light(4, 24, 24), window="none")
+    filter = rt.imaging.DepthInvariantFilter(spectrum, (500.0, 1000.0, math.inf))
+    return element_camera(boundary="circular", normalise="haze", filter=filter, **options)
+
+
+def test_pictures_of_a_periodic_camera_keep_their_light():
+    camera, pictures = periodic_camera(), light(2, 3, 24, 24)
+    image = camera.image(pictures, [500.0, 2000.0])
+    assert image.shape == camera.target(pictures).shape == pictures.shape
+    torch.testing.assert_close(image.mean((-2, -1)), pictures.mean((-2, -1)))
+    kernels = camera.kernels([500.0, 2000.0])
+    assert float(kernels.detach().sum((-2, -1)).max()) < 0.99
+    whole = with_haze(kernels, 24)
+    torch.testing.assert_close(whole.sum((-2, -1)), torch.ones(2, 3, dtype=torch.float64))
+    torch.testing.assert_close(image, blur(pictures, whole, boundary="circular"))
+    dimmed = element_camera(boundary="circular", normalise="energy").image(pictures, [500.0, 2000.0])
+    torch.testing.assert_close(dimmed, blur(pictures, kernels, boundary="circular"))
+
+
+@pytest.mark.parametrize("planned", [False, True])
+def test_the_closed_form_of_an_element_is_the_error_of_its_filtered_pictures(planned):
+    """With a sampling of each call, and with a fixed one."""
+    camera, pictures = periodic_camera(), light(4, 24, 24)
+    if planned:
+        camera.plan(camera.filter.distances)
+    camera.sensor = dataclasses.replace(RGB, read_noise=0.05, saturation=math.inf)
+    expected = camera_error(camera, camera.filter.spectrum, camera.filter.distances)
+    errors = []
+    for depth in camera.filter.distances:
+        for picture in pictures[:, None].expand(4, 3, 24, 24):
+            many = camera.recorded(camera.image(picture[None], depth).expand(40, -1, -1, -1), index=range(40))
+            errors.append((camera.restore(many) - picture).square().mean())
+    assert torch.stack(errors).mean().item() == pytest.approx(expected.item(), rel=0.01)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_derivatives_of_the_closed_form_of_an_element(mirrored):
+    """First and second order against differences, of the kernels and of the octant (pictures equal to their mirror
+    images)."""
+    camera = periodic_camera()
+    camera.plan(camera.filter.distances)
+    S = camera.filter.spectrum
+    if mirrored:
+        S = S + torch.roll(S.flip(-1), 1, -1)
+        S = S + torch.roll(S.flip(-2), 1, -2)
+    kernels = camera.element_kernels(camera.filter.distances)
+    assert (octant_error(kernels, S, torch.tensor(0.05)) is None) != mirrored
+
+    def error(change):
+        return functional_call(camera, {"variables.change": change}, (S,))
+
+    camera.forward = lambda spectrum: camera_error(camera, spectrum, camera.filter.distances)
+    change = torch.tensor([0.7], dtype=torch.float64, requires_grad=True)
+    gradcheck(error, change, eps=1e-5, rtol=1e-4)
+    gradgradcheck(error, change, eps=1e-5, rtol=1e-4)
+
+
 def loss_of(camera, channels):
     points = torch.tensor([[0.0, 0.15], [0.05, -0.1]], dtype=torch.float64)
     distances = torch.tensor(camera.range, dtype=torch.float64)
@@ -262,6 +326,10 @@ def test_states_are_of_their_element():
     ("options", "message"),
     [
         ({"center": "centroid"}, "windows of a phase element are about the chief ray"),
+        ({"normalise": "energy"}, "leave it out; windows have sum 1"),
+        ({"normalise": "haze"}, "leave it out; windows have sum 1"),
+        ({"exact": True}, "exact of a camera with a lens"),
+        ({"boundary": "open"}, "boundary 'open': expected valid or circular"),
         ({"model": "gaussian"}, "model 'gaussian' with phase elements"),
         ({"sensor_distance": 35.5}, "leave sensor_distance out"),
         ({"wavelengths": (0.5,)}, "lens.at"),

@@ -187,6 +187,19 @@ def test_closed_form_is_the_error_of_drawn_noise(name):
     torch.testing.assert_close(found, errors(H, S, sigma, filter=G), rtol=0.01, atol=0)
 
 
+def test_errors_of_many_spectra_are_those_of_each():
+    """Of single pictures, of two depths and three colours, behind one filter."""
+    H = transfer_functions(gaussians(0.5, 1, 1.5, 2, 2.5, 3).unflatten(0, (2, 3)), 80)
+    powers = power_spectrum(leaves()[None, :4])
+    G = depth_invariant_wiener(H, powers.mean(0), 0.05)
+    several = errors(H, powers[:, None, None], 0.05, filter=G)
+    assert several.shape == (4, 2, 3)
+    each = torch.stack([errors(H, power, 0.05, filter=G) for power in powers])
+    torch.testing.assert_close(several, each, rtol=1e-13, atol=0)
+    remaining = powers[:, None, None] * (G * H - 1).abs().square() + 0.05**2 * G.abs().square()
+    torch.testing.assert_close(several, remaining.mean((-2, -1)), rtol=1e-13, atol=0)
+
+
 def test_no_other_filter_does_better_over_colours():
     S, sigma = power_law(16), torch.tensor([0.1, 0.2], dtype=torch.float64)[:, None, None]
     H = transfer_functions(torch.stack([gaussians(0.6, 1.0), gaussians(2.0, 1.4)]), 16)

@@ -13,7 +13,7 @@ import torch
 from problems_training import fit
 
 import raytrace
-from raytrace.imaging.training import NotFinite, OtherSettings, Run, Share
+from raytrace.imaging.training import NotFinite, OtherSettings, Run, Share, train
 
 #: Where processes started by a test find it and the package.
 PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]
@@ -86,6 +86,24 @@ def test_a_loss_that_is_no_number_stops_the_run_before_the_step(tmp_path):
     assert all(bool(torch.isfinite(p).all()) for p in state["module"].values())
     with pytest.raises(NotFinite, match="no checkpoint was made yet"):
         fit(tmp_path / "early", 20, poison=2)
+
+
+def test_rates_follow_the_schedule_of_the_whole_run(tmp_path):
+    """In a resumed run too, whose checkpoint holds the rates of its step."""
+    for stop in (2, None):
+        module = torch.nn.Linear(1, 1)
+        groups = [{"params": [module.weight], "lr": 1.0}, {"params": [module.bias], "lr": 0.5}]
+        optimizer, rates = torch.optim.SGD(groups), {}
+
+        def loss(step, share, module=module, optimizer=optimizer, rates=rates):
+            rates[step] = [group["lr"] for group in optimizer.param_groups]
+            return module(torch.ones(1)).square().sum(), {}
+
+        run = Run(tmp_path, {})
+        for step, _ in train(module, optimizer, loss, steps=4, run=run, every=1, schedule="linear"):
+            if step == stop:
+                break
+    assert rates == {3: [0.25, 0.125]}
 
 
 def test_shares_of_a_batch_are_all_of_it():

@@ -10,26 +10,22 @@ from scripts import script
 
 from raytrace.cli.wave_run import learn
 from raytrace.imaging.pictures import dead_leaves, digest
-from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener
-from raytrace.imaging.training import OtherSettings
-from raytrace.imaging.variables import PhaseVariables
-from raytrace.imaging.wave_camera import (
-    WaveCameraConfig,
-    best_gamma,
-    expected_error,
-    mirrored,
-    periodic,
-    quality,
-    restored,
-    scene,
-    spectrum,
-    transfer,
+from raytrace.imaging.restoration import (
+    depth_invariant_error,
+    depth_invariant_wiener,
+    errors,
+    power_spectrum,
+    psnr,
+    restore,
+    wiener,
 )
-from raytrace.imaging.wave_design import begin, best_of_starts, learn_element, radial_powers, scheduled
+from raytrace.imaging.training import SCHEDULES, OtherSettings
+from raytrace.imaging.variables import PhaseVariables
+from raytrace.imaging.wave_camera import WaveCameraConfig, best_gamma, mirrored, periodic, quality, transfer
+from raytrace.imaging.wave_design import Design, radial_powers
 from raytrace.materials.glass import index
 from raytrace.maths.zernike import polynomials
 from raytrace.settings import DesignSettings
-from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height
 
@@ -40,17 +36,22 @@ records, table_of = edof_table.records, edof_table.table_of
 SMALL = WaveCameraConfig(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 LEAVES = dead_leaves(8, size=64, seed=5, smallest=2.5)
 PICTURES = periodic(LEAVES, 128)
-S, OF_LEAVES = spectrum(PICTURES), digest(LEAVES.samples)
+S, OF_LEAVES = power_spectrum(PICTURES, window="none"), digest(LEAVES.samples)
 QUICK = DesignSettings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
 
 
 def test_light_beyond_the_window_is_added_as_haze():
     """A picture of one shade keeps it; without haze it would darken by what misses the window."""
-    H = transfer(psf(scene(baseline("fresnel", aim()), WaveCameraConfig(depths=(1000.0,), size=31))), 64)
+    camera = WaveCameraConfig(size=31).camera(baseline("fresnel", aim()))
+    H = transfer(camera, 64, [1000.0])
     assert torch.allclose(H[..., 0, 0].real, torch.ones(1, 3, dtype=torch.float64), atol=1e-12)
-    flat = torch.full((1, 64, 64), 0.3, dtype=torch.float64)
-    seen, _ = restored(H[0], torch.ones_like(H[0]), flat, torch.zeros(1, 3, 64, 64, dtype=torch.float64))
-    torch.testing.assert_close(seen, flat[:, None].expand_as(seen), atol=1e-12, rtol=0)
+    flat = torch.full((1, 3, 64, 64), 0.3, dtype=torch.float64)
+    torch.testing.assert_close(camera.image(flat, [1000.0]), flat, atol=1e-12, rtol=0)
+    lost = WaveCameraConfig(size=31).camera(baseline("fresnel", aim()), normalise="energy")
+    assert float(lost.image(flat, [1000.0]).max()) < 0.28
+    detail = PICTURES[:1, None, :64, :64].expand(1, 3, 64, 64)
+    image = torch.fft.ifft2(torch.fft.fft2(detail) * H[0]).real
+    torch.testing.assert_close(camera.image(detail, [1000.0]), image, atol=1e-12, rtol=0)
 
 
 def test_periodic_pictures_have_no_seam_and_their_spectrum_adds_up():
@@ -64,16 +65,17 @@ def test_periodic_pictures_have_no_seam_and_their_spectrum_adds_up():
 
 def test_the_closed_form_is_the_error_of_restored_pictures():
     """Within 1 %: pictures of just this spectrum, noise drawn for each."""
-    elements = baseline("singlet", aim())
-    H = transfer(psf(scene(elements, SMALL)), 128)
+    camera = SMALL.camera(baseline("singlet", aim()))
+    H = transfer(camera, 128, SMALL.depths)
     random = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(24, 1, 128, 128, generator=random, dtype=torch.float64)
     many = PICTURES.repeat(3, 1, 1)
     for G in (depth_invariant_wiener(H, S, SMALL.noise), wiener(H[1], 0.01)):
         expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
-        result = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
+        images = [camera.image(many[:, None], [depth]) + noise for depth in SMALL.depths]
+        result = [(restore(image, G) - many[:, None]).square().mean() for image in images]
         torch.testing.assert_close(torch.stack(result), expected, rtol=0.01, atol=0)
-    own = quality(elements, SMALL, train=PICTURES, test=PICTURES)
+    own = quality(camera, SMALL.depths, design=1000.0, train=PICTURES, test=PICTURES)
     predicted = psnr(errors(H, S, SMALL.noise).mean(1))
     np.testing.assert_allclose(own.by_depth["blind"], predicted.numpy(), atol=0.1)
     assert own.spread["blind"] == pytest.approx(max(own.by_depth["blind"]) - min(own.by_depth["blind"]))
@@ -81,7 +83,7 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
 
 def test_the_best_gamma_is_no_worse_than_its_neighbours():
     """For the kernel at 0.5 m, whose zeros must not be inverted."""
-    H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
+    H = transfer(SMALL.camera(baseline("singlet", aim())), 128, SMALL.depths)
     best = best_gamma(H, S, SMALL.noise, H[0])
 
     def error(gamma):
@@ -90,23 +92,23 @@ def test_the_best_gamma_is_no_worse_than_its_neighbours():
     assert error(best) < min(error(0.8 * best), error(1.25 * best))
 
 
+def error_of(elements):
+    return depth_invariant_error(transfer(SMALL.camera(elements), 128, SMALL.depths), S, SMALL.noise).mean()
+
+
 def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     """Thirty evaluations of the closed form, one colour (sharp lens at 1 m to extended depth of field)."""
     lens = baseline("singlet", aim())[0]
     powers = lens.profile.coefficients.new_zeros(5)
     powers[:1] = lens.profile.coefficients
     smooth = Element(EvenPowers(powers), lens.radius, lens.glass)
-    before, watched = expected_error(transfer(psf(scene([smooth], SMALL)), 128), S, SMALL.noise), []
-    best = best_of_starts(
+    before, watched = error_of([smooth]), []
+    design = Design(dataclasses.replace(QUICK, starts=2, spread=0.3, start_steps=30), SMALL, S)
+    best = design.best_of_starts(
         lambda: PhaseVariables(smooth, basis=radial_powers(smooth.radius, 5)),
-        SMALL,
-        S,
-        starts=2,
-        spread=0.3,
-        steps=30,
         watch=lambda *report: watched.append(report),
     )
-    after = expected_error(transfer(psf(scene(best(), SMALL)), 128), S, SMALL.noise)
+    after = error_of(best())
     assert float(psnr(after.detach()) - psnr(before.detach())) > 2
     for start in (1, 2):
         evaluations = [evaluation for number, evaluation, _ in watched if number == start]
@@ -130,8 +132,9 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
     ends = []
     for name, stop in (("whole", None), ("broken", 7)):
         for _ in range(1 if stop is None else 2):
-            camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
-            for step, _record in learn_element(camera, LEAVES, settings, run, every=5):
+            design = Design(settings, SMALL, S)
+            camera, run = design.begin(tmp_path / name, pictures=OF_LEAVES)
+            for step, _record in design.learn(camera, LEAVES, run, every=5):
                 if step == stop:
                     stop = None
                     break
@@ -139,16 +142,16 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
         assert [row["step"] for row in run.rows()] == list(range(settings.steps))
     assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
     with pytest.raises(OtherSettings, match="rate was"):
-        begin(dataclasses.replace(settings, rate=0.01), SMALL, S, tmp_path / "whole", pictures=OF_LEAVES)
+        Design(dataclasses.replace(settings, rate=0.01), SMALL, S).begin(tmp_path / "whole", pictures=OF_LEAVES)
 
 
 def test_a_run_is_that_of_its_pictures(tmp_path):
     """As many others are refused, whether it has finished or not."""
     settings, others = dataclasses.replace(QUICK, steps=1), dead_leaves(8, size=64, seed=6, smallest=2.5)
-    initial = learn(settings, SMALL, LEAVES, tmp_path, "finished").initial
-    again = learn(settings, SMALL, LEAVES, tmp_path, "finished")
-    assert torch.equal(again.initial[0].numbers, initial[0].numbers)
-    assert not torch.equal(again.variables()[0].numbers, initial[0].numbers)
+    _, initial, _ = learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    _, before, after = learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    assert torch.equal(before.elements()[0].numbers, initial.elements()[0].numbers)
+    assert not torch.equal(after.elements()[0].numbers, initial.elements()[0].numbers)
     for _ in range(2):
         with pytest.raises(OtherSettings, match=f"pictures was '8, blake2 .*, now '{digest(others.samples)}'"):
             learn(settings, SMALL, others, tmp_path, "others")
@@ -159,11 +162,13 @@ def test_a_run_is_that_of_its_pictures(tmp_path):
 def test_pictures_teach_the_filter_of_the_original(tmp_path):
     """Weight and target depth move with the heights, and the loss of the same draws falls."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="towards", steps=25, batch=4)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
-    first = [float(camera.v), float(camera.t), camera.variables.change.detach().clone()]
-    losses = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
-    assert float(camera.v) != first[0]
-    assert float(camera.t) != first[1]
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
+    filter = camera.filter
+    first = [float(filter.v), float(filter.t), camera.variables.change.detach().clone()]
+    losses = [record["loss"] for _, record in design.learn(camera, LEAVES, run)]
+    assert float(filter.v) != first[0]
+    assert float(filter.t) != first[1]
     assert not torch.equal(camera.variables.change, first[2])
     assert np.mean(losses[-8:]) < np.mean(losses[:8])
 
@@ -171,15 +176,15 @@ def test_pictures_teach_the_filter_of_the_original(tmp_path):
 def test_a_network_learns_behind_the_filter(tmp_path):
     """It begins as nothing at all, and both it and the element move."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="network", steps=4, batch=2)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
     with torch.no_grad():
-        noise = torch.zeros(2, 1, 128, 128, dtype=torch.float64)
-        both = camera(PICTURES[:2], torch.tensor([0, 2]), noise)
-        camera.network, network = None, camera.network
-        torch.testing.assert_close(both, camera(PICTURES[:2], torch.tensor([0, 2]), noise), atol=1e-6, rtol=0)
-        camera.network = network
+        both = camera(PICTURES[:2], [500.0, math.inf], index=[0, 1])
+        alone, network = SMALL.camera(camera.variables, filter=camera.filter), camera.network
+        alone.plan(SMALL.depths)
+        torch.testing.assert_close(both, alone(PICTURES[:2], [500.0, math.inf], index=[0, 1]), atol=1e-6, rtol=0)
     before = [p.detach().clone() for p in (network.decoder[-1].weight, camera.variables.change)]
-    for _ in learn_element(camera, LEAVES, settings, run):
+    for _ in design.learn(camera, LEAVES, run):
         pass
     for old, new in zip(before, (network.decoder[-1].weight, camera.variables.change), strict=True):
         assert not torch.equal(old, new)
@@ -190,13 +195,12 @@ def test_every_kind_of_element_is_learned(tmp_path, kind, levels):
     settings = dataclasses.replace(
         QUICK, kind=kind, levels=levels, terms=11 if kind == "zernike" else 4, pitch=0.02, steps=6, spread=0.05
     )
-    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
-    with torch.no_grad():
-        before = float(expected_error(camera.transfer(), S, SMALL.noise))
-    for _ in learn_element(camera, LEAVES, settings, run):
+    design = Design(settings, SMALL, S)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
+    before = design.expected_error(camera)
+    for _ in design.learn(camera, LEAVES, run):
         pass
-    with torch.no_grad():
-        after = float(expected_error(camera.transfer(), S, SMALL.noise))
+    after = design.expected_error(camera)
     assert after < before
     (element, *_) = camera.variables()
     if levels:
@@ -210,10 +214,10 @@ def made_heights(element):
 
 
 def test_schedules_are_functions_of_the_step():
-    assert scheduled("cosine", 0) == 1
-    assert scheduled("cosine", 1) == pytest.approx(0)
-    assert scheduled("linear", 0.25) == 0.75
-    assert scheduled("constant", 0.9) == 1
+    assert SCHEDULES["cosine"](0) == 1
+    assert SCHEDULES["cosine"](1) == pytest.approx(0)
+    assert SCHEDULES["linear"](0.25) == 0.75
+    assert SCHEDULES["constant"](0.9) == 1
 
 
 def test_powers_are_zernike_polynomials():
@@ -243,14 +247,15 @@ def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):
     losses = {}
     for name, change in {"off": {"tolerance": 0.0}, "on": {}, "again": {}, "seed": {"seed": 1}}.items():
         settings = dataclasses.replace(still, **change)
-        camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
-        losses[name] = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
+        design = Design(settings, SMALL, S)
+        camera, run = design.begin(tmp_path / name, pictures=OF_LEAVES)
+        losses[name] = [record["loss"] for _, record in design.learn(camera, LEAVES, run)]
     assert np.ptp(losses["off"]) < 1e-9 * losses["off"][0]
     assert len(set(losses["on"])) == 4
     assert losses["again"] == losses["on"]
     assert not set(losses["seed"]) & set(losses["on"])
     with pytest.raises(ValueError, match="belongs to rings"):
-        begin(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S, tmp_path / "smooth", pictures=OF_LEAVES)
+        Design(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S).begin(tmp_path / "smooth", pictures=OF_LEAVES)
 
 
 def test_mirrored():
@@ -272,8 +277,8 @@ def test_the_table_lists_known_values():
 def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
     """Both plates have the one that is best on the PMMA lens; rows that are not learned yet are left out."""
     tried = []
-    real = edof_table.expected_error
-    monkeypatch.setattr(edof_table, "expected_error", lambda *given: tried.append(0) or real(*given))
+    real = edof_table.camera_error
+    monkeypatch.setattr(edof_table, "camera_error", lambda *given: tried.append(0) or real(*given))
     result = elements_of(["cubic-refractive", "learned", "cubic"], SMALL, S, learned={})
     assert list(result) == ["cubic", "cubic-refractive"]
     assert len(tried) == len(STRENGTHS)
@@ -287,13 +292,14 @@ def test_the_order_that_was_published(tmp_path):
     config = WaveCameraConfig(size=127, pixel=0.00738)
     pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)
     content = Content("leaves", pictures[:8], pictures[8:])
-    spectrum_ = spectrum(content.train)
+    spectrum_ = power_spectrum(content.train, window="none")
     settings = DesignSettings(steps=60, starts=2)
-    camera, run = begin(settings, config, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
-    for _ in learn_element(camera, LEAVES, settings, run):
+    design = Design(settings, config, spectrum_)
+    camera, run = design.begin(tmp_path / "run", pictures=OF_LEAVES)
+    for _ in design.learn(camera, LEAVES, run):
         pass
     with torch.no_grad():
-        learned = {"learned": camera.variables()}
+        learned = {"learned": camera.elements()}
     names = ["fresnel", "multifocal", "cubic", "hybrid", "achromat", "learned"]
     result = table_of([content], elements_of(names, config, spectrum_, learned=learned), config)["leaves"]
     blind = {name: result[name].mean["blind"] for name in names}

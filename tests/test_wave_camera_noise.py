@@ -12,25 +12,23 @@ from scripts import script
 
 from raytrace.cli import wave_run
 from raytrace.cli.run import CommandError
+from raytrace.imaging.closed_form import camera_error
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, dead_leaves
-from raytrace.imaging.restoration import depth_invariant_density, depth_invariant_error, depth_invariant_wiener, psnr
-from raytrace.imaging.training import OtherSettings
-from raytrace.imaging.wave_camera import (
-    FILTERS,
-    ClosedForm,
-    WaveCameraConfig,
-    expected_error,
-    periodic,
-    quality,
-    restored,
-    scene,
-    spectrum,
-    transfer,
+from raytrace.imaging.restoration import (
+    depth_invariant_density,
+    depth_invariant_error,
+    depth_invariant_wiener,
+    power_spectrum,
+    psnr,
+    restore,
 )
-from raytrace.wave_optics.compute import psf
+from raytrace.imaging.training import OtherSettings
+from raytrace.imaging.variables import PhaseVariables
+from raytrace.imaging.wave_camera import FILTERS, WaveCameraConfig, periodic, quality, transfer
+from raytrace.maths.sampling import grid
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.element import Element, Zernike
+from raytrace.wave_optics.element import Element, Rings, Zernike
 from raytrace.wave_optics.element_files import write_element
 from raytrace.wave_optics.fabrication import as_rings
 from raytrace.wave_optics.plan import plan
@@ -45,63 +43,72 @@ mean_psnr, pooled_psnr, units, scores = noise.mean_psnr, noise.pooled_psnr, nois
 Kept, OverNoise, Score, judge_files = noise.Kept, noise.OverNoise, noise.Score, noise.judge_files
 SMALL = WaveCameraConfig(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)
-S = spectrum(PICTURES)
+S = power_spectrum(PICTURES, window="none")
 LEARNED = str(Path(__file__).parents[1] / "docs/wave/elements/learned-0.01.npy")
 
 
 @pytest.mark.parametrize("name", ["singlet", "fresnel", "hybrid"])
 def test_an_octant_is_the_closed_form_of_the_kernels(name):
-    """Error and its gradient to 1e-7, rings, wraps and smooth lenses; single precision to 1e-5."""
-    elements = baseline(name, aim())
-    free = elements[0].numbers.detach().clone().requires_grad_()
-    elements = (elements[0].with_numbers(free), *elements[1:])
-    H = transfer(psf(scene(elements, SMALL)), 128)
-    expected = expected_error(H, S, SMALL.noise)
-    slope = torch.autograd.grad(expected, free)[0]
+    """Error and its gradient to 1e-7, wraps and smooth lenses; of rings in single precision to 1e-5."""
+    first, *others = baseline(name, aim())
+    variables = PhaseVariables(first, others=others)
+    camera = SMALL.camera(variables)
+    expected = camera_error(camera, S, SMALL.depths)
+    H = transfer(camera, 128, SMALL.depths)
+    torch.testing.assert_close(expected, depth_invariant_error(H, S, SMALL.noise).mean(), rtol=1e-12, atol=0)
+    slope = torch.autograd.grad(expected, variables.change)[0]
+    camera.plan(SMALL.depths)
+    result = camera_error(camera, S, SMALL.depths)
+    tolerance = 1e-5 if isinstance(first.profile, Rings) else 1e-7
+    torch.testing.assert_close(result, expected, rtol=tolerance, atol=0)
+    own = torch.autograd.grad(result, variables.change)[0]
+    assert float((own - slope).norm()) < 100 * tolerance * float(slope.norm())
     for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 1e-5)):
-        result = ClosedForm(elements, SMALL, S, dtype=dtype)(elements)
-        torch.testing.assert_close(result, expected, rtol=tolerance, atol=0)
-        own = torch.autograd.grad(result, free)[0]
-        assert float((own - slope).norm()) < 100 * tolerance * float(slope.norm())
+        kernels = camera.element_kernels(SMALL.depths)
+        part = Octant(kernels.scene, kernels.plan, 128, dtype=dtype)
+        error = part.error(part.transfer(kernels.scene), S, SMALL.noise)
+        torch.testing.assert_close(error, expected, rtol=tolerance, atol=0)
 
 
 def test_frequencies_of_the_octant_are_those_of_the_kernels():
-    own = scene(baseline("fresnel", aim()), SMALL)
-    how = plan(own)
-    result = Octant(own, how, 128).transfer(own)
-    H = transfer(psf(own, plan=how), 128).real
+    camera = SMALL.camera(baseline("fresnel", aim()))
+    own = camera.element_kernels(SMALL.depths).scene
+    result = Octant(own, plan(own), 128).transfer(own)
+    H = transfer(camera, 128, SMALL.depths).real
     a, b = torch.triu_indices(65, 65)
     torch.testing.assert_close(result, H[..., a, b], rtol=0, atol=1e-7)
 
 
 def test_pictures_that_are_not_their_mirror_images_have_no_octant():
-    own = scene(baseline("fresnel", aim()), SMALL)
+    own = SMALL.camera(baseline("fresnel", aim())).element_kernels(SMALL.depths).scene
     how = plan(own)
     assert fits(own, how, S)
     lopsided = S.clone()
     lopsided[3, 5] *= 2
     assert not fits(own, how, lopsided)
-    even = scene(baseline("fresnel", aim()), dataclasses.replace(SMALL, size=64))
+    even = dataclasses.replace(own, grid=grid(own.grid.pitch, 64))
     assert not fits(even, plan(even), S)
 
 
 def test_density_adds_up_to_the_error():
-    H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
+    H = transfer(SMALL.camera(baseline("singlet", aim())), 128, SMALL.depths)
     torch.testing.assert_close(depth_invariant_density(H, S, 0.01).mean((-2, -1)), depth_invariant_error(H, S, 0.01))
 
 
 def test_errors_of_pictures_are_those_of_pictures_restored():
     """Each picture with noise drawn, within what that noise leaves open; their mean is what the table says."""
     bank = Bank.of("leaves", PICTURES[:5], PICTURES[5:])
-    elements = baseline("singlet", aim())
-    H = transfer(psf(scene(elements, SMALL)), 128)
+    camera = SMALL.camera(baseline("singlet", aim()))
+    H = transfer(camera, 128, SMALL.depths)
     result = errors_of(H, SMALL, bank)
     generator = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(3, 2, 128, 128, generator=generator, dtype=torch.float64)
     G = depth_invariant_wiener(H, bank.spectrum, SMALL.noise)
-    left = [(restored(H_z, G, PICTURES[5:], noise)[1] - PICTURES[5:, None]).square().mean((-2, -1)) for H_z in H]
+    pictures = PICTURES[5:, None].expand(3, 2, 128, 128)
+    images = [camera.image(pictures, [depth]) + noise for depth in SMALL.depths]
+    left = [(restore(image, G) - pictures).square().mean((-2, -1)) for image in images]
     torch.testing.assert_close(result["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
-    table = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])
+    table = quality(camera, SMALL.depths, design=1000.0, train=PICTURES[:5], test=PICTURES[5:])
     for name in ("wiener", "blind"):
         assert float(pooled_psnr(result[name])) == pytest.approx(table.mean[name], abs=1e-9)
         assert float(mean_psnr(result[name])) == pytest.approx(table.of_pictures[name], abs=1e-9)
@@ -182,7 +189,7 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
     def errors_by(name):
         def H():
             made.append(name)
-            return transfer(psf(scene(baseline(name, aim()), SMALL)), 128)
+            return transfer(SMALL.camera(baseline(name, aim())), 128, SMALL.depths)
 
         return kept.find(name, SMALL, H)
 
@@ -274,7 +281,9 @@ def test_the_figure_over_noise_draws_files_by_their_names():
 
 @pytest.mark.slow
 def test_strengths_fall_with_the_noise():
-    result = best_strengths([0.001, 0.02], spectrum(periodic(dead_leaves(4, size=128, smallest=2.5), 256)))
+    result = best_strengths(
+        [0.001, 0.02], power_spectrum(periodic(dead_leaves(4, size=128, smallest=2.5), 256), window="none")
+    )
     assert result[0.001] >= result[0.02]
 
 

@@ -33,10 +33,11 @@ from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
 from raytrace.files import table as csv
-from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.closed_form import camera_error
+from raytrace.imaging.image import transfer_functions, with_haze
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
 from raytrace.imaging.render import ImageFormation, render
-from raytrace.imaging.restoration import depth_invariant_wiener, psnr, restore
+from raytrace.imaging.restoration import depth_invariant_wiener, power_spectrum, psnr, restore
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.wave_camera import (
     FILTERS,
@@ -44,13 +45,10 @@ from raytrace.imaging.wave_camera import (
     Quality,
     WaveCameraConfig,
     depth_text,
-    expected_error,
-    kernels,
     mark_depths,
     mirrored,
     periodic,
     quality,
-    spectrum,
     transfer,
 )
 from raytrace.maths.result import Result, plain
@@ -155,7 +153,7 @@ def elements_of(
 
 def _error_of_cubic(strength: float, made_for: Aim, config: WaveCameraConfig, S: Tensor) -> float:
     elements = baseline("cubic-refractive", made_for, strength=strength)
-    return float(expected_error(transfer(kernels(elements, config), S.shape[-1]), S, config.noise))
+    return float(camera_error(config.camera(elements), S, config.depths).detach())
 
 
 def table_of(
@@ -168,9 +166,11 @@ def table_of(
     """Quality by content and row, of the elements of each row."""
     found: dict[str, dict[str, Quality]] = {content.name: {} for content in contents}
     for name in progress(list(elements)):
-        own = kernels(elements[name], config)
+        camera = config.camera(elements[name])
+        with torch.no_grad():
+            how = {"design": config.design, "kernels": camera.kernels(config.depths)}
         for content in contents:
-            found[content.name][name] = quality(elements[name], config, train=content.train, test=content.test, psf=own)
+            found[content.name][name] = quality(camera, config.depths, train=content.train, test=content.test, **how)
     return found
 
 
@@ -226,17 +226,17 @@ def flat(
     """
     size, part = 512, slice(40, 200)
     leaves = coloured_leaves(size // 2, colours=len(config.wavelengths), seed=seed)
-    picture = torch.as_tensor(np.stack([mirrored(colour) for colour in leaves]))
-    S, noise = spectrum(picture), noise_like(picture, config, seed)
+    picture = mirrored(leaves)
+    S, noise = power_spectrum(picture, window="none"), noise_like(picture, config, seed)
     found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
     for name, own in elements.items():
-        H = transfer(kernels(own, config), size)
-        G = depth_invariant_wiener(H, S, config.noise)
+        camera = config.camera(own)
+        G = depth_invariant_wiener(transfer(camera, size, config.depths), S, config.noise)
         found[name] = {}
-        for d in (0, len(H) // 2, len(H) - 1):
-            estimate = torch.fft.ifft2(torch.fft.fft2(torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise) * G)
-            ratio = float(psnr((estimate.real - picture).square().mean()))
-            found[name][depth_text(config.depths[d])] = shown(estimate.real[:, part, part]), ratio
+        for depth in (config.depths[0], config.depths[len(config.depths) // 2], config.depths[-1]):
+            estimate = restore(camera.image(picture[None], [depth])[0] + noise, G)
+            ratio = float(psnr((estimate - picture).square().mean()))
+            found[name][depth_text(depth)] = shown(estimate[:, part, part]), ratio
     return found, shown(picture[:, part, part])
 
 
@@ -254,7 +254,7 @@ def deep(elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *,
     sensor = Sensor(tuple(config.pixel * count for count in pixels), pixels, response=response)
     how = {"sensor": sensor, "sensor_distance": config.sensor_distance, "wavelengths": config.wavelengths}
     how |= {"depth": 1e3 / depth, "planes": _LAYERS, "softness": 0.1, "size": config.size}
-    truth, S = picture[:, half:-half, half:-half], spectrum(picture)
+    truth, S = picture[:, half:-half, half:-half], power_spectrum(picture, window="none")
     seen, back = {}, {}
     for name, own in elements.items():
         # Columns of a sensor grow towards -x, those of the page towards +x.
@@ -270,10 +270,8 @@ def deep(elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *,
 
 def transfer_of(formation: ImageFormation) -> Tensor:
     """H (D, C, rows, columns) of the kernels of elements, columns towards +x; light beyond the window is haze."""
-    window = (1 - formation.haze)[..., None, None]
-    H = transfer_functions(window * formation.kernels[0, 0].flip(-1), formation.sensor.pixels[::-1])
-    H[..., 0, 0] += formation.haze
-    return H
+    kernels, size = (1 - formation.haze)[..., None, None] * formation.kernels[0, 0].flip(-1), formation.sensor.pixels
+    return transfer_functions(with_haze(kernels, size[::-1]), size[::-1])
 
 
 def noise_like(like: Tensor, config: WaveCameraConfig, seed: int) -> Tensor:
@@ -434,7 +432,7 @@ def edof(arguments: argparse.Namespace) -> Table:
     rows, config = [*(arguments.rows or usual), *(arguments.also or ())], WaveCameraConfig()
     contents, train = contents_of(arguments)
     learned = _learned(arguments, rows, config, train)
-    elements = elements_of(rows, config, spectrum(contents[0].train), learned=learned)
+    elements = elements_of(rows, config, power_spectrum(contents[0].train, window="none"), learned=learned)
     found = table_of(contents, elements, config, progress=lambda given: progress(given, "row"))
     if arguments.figures:
         Path(arguments.figures).mkdir(parents=True, exist_ok=True)
@@ -479,8 +477,8 @@ def _learned(
                 continue
             folder = Path(arguments.folder or unkept) / name
             with torch.enable_grad():
-                camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
-            found[name] = camera.variables()
+                *_, camera = learn(DesignSettings.of(common, **learning), config, train, folder, ROWS[name].title)
+            found[name] = camera.elements()
     return found
 
 
@@ -498,7 +496,9 @@ def figures(found, elements: Mapping[str, Sequence[Element]], config: WaveCamera
     first = next(iter(found.values()))
     made = {"depth.png": depth_figure(found, config)}
     for name in {"learned", "learned-smooth"} & set(elements):
-        report = ElementReport(elements[name], config, kernels(elements[name], config), first[name])
+        with torch.no_grad():
+            kernels = config.camera(elements[name]).kernels(config.depths)
+        report = ElementReport(elements[name], config, kernels, first[name])
         made[f"{name}.png"] = report.plot()
     scene = {name: elements[name] for name in _SHOWN if name in elements}
     made["scene.png"] = scene_figure(*flat(scene, config, seed=seed))

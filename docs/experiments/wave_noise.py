@@ -47,25 +47,25 @@ from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import learn
 from raytrace.files import table
+from raytrace.imaging.camera import Camera
 from raytrace.imaging.pictures import Pictures, draws
-from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, wiener
-from raytrace.imaging.wave_camera import (
-    FILTERS,
-    WAVELENGTH,
-    ClosedForm,
-    WaveCameraConfig,
-    best_gamma,
-    errors_of_pictures,
-    kernels,
-    power,
-    transfer,
+from raytrace.imaging.restoration import (
+    depth_invariant_error,
+    depth_invariant_wiener,
+    errors,
+    power_spectrum,
+    psnr,
+    wiener,
 )
-from raytrace.imaging.wave_design import WaveCamera
+from raytrace.imaging.variables import PhaseVariables
+from raytrace.imaging.wave_camera import FILTERS, WaveCameraConfig, best_gamma, transfer
+from raytrace.imaging.wave_design import Design
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import Result
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 from raytrace.settings import DesignSettings
 from raytrace.settings import Settings as BaseSettings
+from raytrace.wave_optics.compute import DESIGN
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Rings, is_flat
 from raytrace.wave_optics.element_files import SMOOTH, read_element, write_element
@@ -165,8 +165,8 @@ class Bank:
     @classmethod
     def of(cls, name: str, train: Tensor, test: Tensor, classes: Sequence[str] = ()) -> "Bank":
         """Periodic pictures (A, n, n) to make filters for, (B, n, n) to restore, and the classes of the latter."""
-        powers = [power(picture) for picture in test]
-        return cls(name, sum(map(power, train)) / len(train), torch.stack(powers), tuple(classes))
+        powers = power_spectrum(test[None], window="none")
+        return cls(name, power_spectrum(train, window="none"), powers, tuple(classes))
 
     @property
     def class_count(self) -> int:
@@ -187,7 +187,8 @@ def errors_of(H: Tensor, config: WaveCameraConfig, bank: Bank) -> Errors:
     at_design = H[config.depths.index(config.design)]
     gamma = best_gamma(H, bank.spectrum, config.noise, at_design)
     filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, bank.spectrum, config.noise)}
-    return {name: errors_of_pictures(H, G, config.noise, bank.powers) for name, G in filters.items()}
+    powers = bank.powers[:, None, None]
+    return {name: errors(H, powers, config.noise, filter=G) for name, G in filters.items()}
 
 
 def pooled_psnr(errors: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -288,7 +289,8 @@ def best_strengths(noises: Sequence[float], S: Tensor) -> dict[float, float]:
     made_for = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
     found = {}
     for strength in STRENGTHS:
-        H = transfer(kernels(baseline("cubic-refractive", made_for, strength=strength), config), S.shape[-1])
+        camera = config.camera(baseline("cubic-refractive", made_for, strength=strength))
+        H = transfer(camera, S.shape[-1], config.depths)
         found[strength] = {noise: float(depth_invariant_error(H, S, noise).mean()) for noise in noises}
     return {noise: min(STRENGTHS, key=lambda own: found[own][noise]) for noise in noises}
 
@@ -405,8 +407,8 @@ def _rows(asked: Sequence[str] | None) -> list[str]:
     return [name for name in ROWS if name in wanted]
 
 
-def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> WaveCamera:
-    """The camera of a unit, learned as far as is left."""
+def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> tuple[Design, Camera, Camera]:
+    """The design of a unit, its initial camera and the one that is learned as far as is left."""
     label = f"{ROWS[unit.row].title}, noise {unit.noise:g}, start {unit.start}"
     return learn(unit.settings(settings.steps), unit.config(), train, unit.folder(root), label)
 
@@ -415,20 +417,23 @@ class Kept:
     """Errors of every picture, stored in a folder: computed once for these pictures."""
 
     def __init__(self, folder: Path, banks: Sequence[Bank]):
-        self.banks, self._forms = banks, {}
+        self.banks, self._cameras = banks, {}
         self.store = Store(folder, {"pictures": {bank.name: bank.mark for bank in banks}})
 
     def transfer(self, elements: Sequence[Element]) -> Tensor:
         """H (D, W, n, n) of designed elements at any noise; the part that heights of rings do not change is cached."""
-        S = self.banks[0].spectrum
-        if len(elements) > 1 or not isinstance(elements[0].profile, Rings):
-            return transfer(kernels(elements, WaveCameraConfig()), S.shape[-1])
-        own = elements[0]
+        config, size = WaveCameraConfig(), self.banks[0].spectrum.shape[-1]
+        own, *others = elements
+        if others or not isinstance(own.profile, Rings):
+            return transfer(config.camera(elements), size, config.depths)
+        # One sampling and its sums for rings of all heights: those of the first one, without wraps.
         mark = own.glass.formula, mark_of(own.glass.coefficients, own.profile.pitch, own.radius)
-        if mark not in self._forms:
-            whole = dataclasses.replace(own, period=None, levels=0)
-            self._forms[mark] = ClosedForm((whole,), WaveCameraConfig(), S)
-        return self._forms[mark].transfer(elements)
+        if mark not in self._cameras:
+            self._cameras[mark] = config.camera((dataclasses.replace(own, period=None, levels=0),))
+            self._cameras[mark].plan(config.depths)
+        camera = self._cameras[mark]
+        camera.variables = PhaseVariables(own).requires_grad_(False)
+        return transfer(camera, size, config.depths)
 
     def find(self, name: str, config: WaveCameraConfig, make: Callable[[], Tensor]) -> dict[str, Errors]:
         """Errors by content of transfer functions, computed only if they are not stored."""
@@ -457,7 +462,8 @@ def judge_baselines(
 
         def H(made=made, elements=elements) -> Tensor:
             if not made:
-                made.append(transfer(kernels(elements, WaveCameraConfig()), size))
+                config = WaveCameraConfig()
+                made.append(transfer(config.camera(elements), size, config.depths))
             return made[0]
 
         for own in noises:
@@ -511,7 +517,7 @@ def _best_learned(
             best[unit.row, unit.noise] = unit
     found = {}
     for (row, own), unit in best.items():
-        element = detached(learn_unit(unit, settings, train, root).variables()[0])
+        element = detached(learn_unit(unit, settings, train, root)[-1].elements()[0])
         name, made = (".npy", fabricated(element)) if is_flat(element) else (SMOOTH, element)
         found[f"{row}-{own:g}{name}"] = made
     return found
@@ -522,11 +528,11 @@ def judge_learned(
 ) -> tuple[float, dict[str, Errors]]:
     """Its expected error, that of learning, and errors of pictures."""
     name = f"{unit.row}-{unit.noise:g}-{unit.start}"
-    camera = learn_unit(unit, settings, train, root)
+    design, _, camera = learn_unit(unit, settings, train, root)
     with torch.no_grad():
-        elements = detached(camera.variables())
+        elements = detached(camera.elements())
         found = kept.find(name, unit.config(), lambda: kept.transfer(elements))
-        return kept.store.number(name, lambda: float(camera.expected(elements))), found
+        return kept.store.number(name, lambda: design.expected_error(camera)), found
 
 
 def scores(
@@ -544,9 +550,9 @@ def scores(
         weights = bank.drawn(seed=settings.seed)
         for filter in FILTERS:
             base = {own: fixed["fresnel", own][bank.name][filter] for own in settings.noise}
-            for (row, own), errors in [*fixed.items(), *by.items()]:
-                several = isinstance(errors, list)
-                ordered = [e for _, e in sorted(errors, key=lambda one: one[0])] if several else [errors]
+            for (row, own), stored in [*fixed.items(), *by.items()]:
+                several = isinstance(stored, list)
+                ordered = [e for _, e in sorted(stored, key=lambda one: one[0])] if several else [stored]
                 given = [each[bank.name][filter] for each in ordered]
                 starts = tuple(float(pooled_psnr(e) - pooled_psnr(base[own])) for e in given) if several else ()
                 yield Score(bank.name, filter, own, row, Gains.of(given[0], base[own], weights), starts)
@@ -560,7 +566,7 @@ def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
     beside = docs / "wave" / "elements"
     beside.mkdir(parents=True, exist_ok=True)
     for name, element in elements.items():
-        write_element(element, beside / name, design_wavelength=WAVELENGTH)
+        write_element(element, beside / name, design_wavelength=DESIGN)
 
 
 def element_words(arguments: argparse.Namespace) -> list[str]:

@@ -1,6 +1,7 @@
 """`raytrace wave design` and `raytrace wave restore`: a designed phase element, and images restored behind one."""
 
 import argparse
+import copy
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
@@ -14,21 +15,15 @@ from raytrace.cli.progress import progress
 from raytrace.cli.run import CommandError, catalogs, say
 from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
-from raytrace.imaging.image import blur
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.closed_form import field_filters
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
-from raytrace.imaging.restoration import depth_invariant_wiener, power_law, psnr, restore
-from raytrace.imaging.wave_camera import (
-    ElementReport,
-    WaveCameraConfig,
-    depth_text,
-    kernels,
-    periodic,
-    quality,
-    spectrum,
-    transfer,
-)
-from raytrace.imaging.wave_design import WaveCamera, begin, learn_element
+from raytrace.imaging.restoration import power_law, power_spectrum, psnr, restore
+from raytrace.imaging.variables import PhaseVariables
+from raytrace.imaging.wave_camera import ElementReport, WaveCameraConfig, depth_text, periodic
+from raytrace.imaging.wave_design import Design
 from raytrace.io.pictures import read_channels, write_picture
+from raytrace.maths.numerics import detached
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.settings import DesignSettings
 from raytrace.tracing.compiled import prepare
@@ -101,15 +96,12 @@ def design(arguments: argparse.Namespace) -> DesignedElement:
     label = f"{settings.kind}, seed {settings.seed}"
     with progress(None, what=f"{label}: training pictures"):
         train, test = split(training_pictures(arguments, "sharp leaves"))
-    camera = learn(settings, config, train, folder, label)
+    design, *cameras = learn(settings, config, train, folder, label)
     pictures = {"train": periodic(train, WIDE), "test": periodic(test, WIDE)}
-    with torch.no_grad():
-        parts, reports = camera.variables(), []
-        for either in progress([camera.initial, parts], "element", what=f"{label}: image quality"):
-            psf = kernels(either, config)
-            reports.append(ElementReport(either, config, psf, quality(either, config, **pictures, psf=psf)))
-        errors = float(camera.expected(camera.initial)), float(camera.expected(parts))
-    initial, after = reports
+    bar = progress(cameras, "element", what=f"{label}: image quality")
+    initial, after = (ElementReport.of(detached(camera.elements()), config, **pictures) for camera in bar)
+    before, designed_error = map(design.expected_error, cameras)
+    errors, parts = (before, designed_error), after.elements
     designed = DesignedElement(parts, config, after.kernels, after.quality, settings, errors, initial=initial)
     write_json(folder / "outcome.json", designed.document())
     heights = fabricated(parts[0]) if settings.kind == "rings" else as_pixels(parts[0], config.pixel)
@@ -135,10 +127,13 @@ def _design_settings(arguments: argparse.Namespace) -> DesignSettings:
     return DesignSettings.of(options, **more)
 
 
-def learn(settings: DesignSettings, config: WaveCameraConfig, train: Pictures, folder: Path, label: str) -> WaveCamera:
-    """An optimised camera: the remaining steps of its run, with a bar."""
+def learn(
+    settings: DesignSettings, config: WaveCameraConfig, train: Pictures, folder: Path, label: str
+) -> tuple[Design, Camera[PhaseVariables], Camera[PhaseVariables]]:
+    """The design, its initial and its optimised camera: the remaining steps of its run, with a bar."""
     with progress(None, what=f"{label}: spectrum of the pictures"):
-        S, images = spectrum(periodic(train, settings.size)), digest(train.samples)
+        S, images = power_spectrum(periodic(train, settings.size), window="none"), digest(train.samples)
+    design = Design(settings, config, S)
     bars = []
 
     def starts(items: Iterable) -> Iterable:
@@ -149,12 +144,13 @@ def learn(settings: DesignSettings, config: WaveCameraConfig, train: Pictures, f
         bars[-1].set_postfix_str(f"start {start}: evaluation {evaluation}, error {error:.6f}", refresh=False)
 
     with progress(None, what=f"{label}: initial element"):
-        camera, run = begin(settings, config, S, folder, pictures=images, progress=starts, watch=watch)
+        camera, run = design.begin(folder, pictures=images, progress=starts, watch=watch)
+        initial = copy.deepcopy(camera)
     with progress(None, what=f"{label}: compiling the trace"):
         prepare()
     record = None
     with progress(settings.steps, what=f"{label}: optimisation") as bar:
-        for step, record in learn_element(camera, train, settings, run):
+        for step, record in design.learn(camera, train, run):
             if bar.n < step:  # resumed
                 bar.n = bar.initial = step
             bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
@@ -163,7 +159,7 @@ def learn(settings: DesignSettings, config: WaveCameraConfig, train: Pictures, f
         say(f"{label}: finished before, nothing to learn")
     else:
         say(f"{label}: loss {record['loss']:.6f} after {settings.steps} steps")
-    return camera
+    return design, initial, camera
 
 
 def training_pictures(arguments: argparse.Namespace, leaves: str) -> Pictures:
@@ -208,15 +204,13 @@ def captured_and_restored(
 
     simulate: object distance in mm; the image is then a scene, whose borders the camera reflects.
     """
+    camera = config.camera(parts, boundary="reflect")
     if simulate is not None:
-        psf = kernels(parts, config, depths=[simulate])
-        haze = (1 - psf.energy[0])[:, None, None] * image.mean((-2, -1), keepdim=True)
-        noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(seed), dtype=image.dtype)
-        image = blur(image, psf.kernel[0], boundary="reflect") + haze + config.noise * noise
+        (image,) = camera.recorded(camera.image(image[None], [simulate]), index=[0], seed=seed)
     shape = tuple(extent + config.size - 1 for extent in image.shape[-2:])
-    H = transfer(kernels(parts, config), shape)
     S = power_law(shape, mean=float(image.mean()), deviation=max(float(image.std()), config.noise))
-    return image, restore(image, depth_invariant_wiener(H, S, config.noise), boundary="taper")
+    (G,) = field_filters(camera, S, [0.0], config.depths)
+    return image, restore(image, G, boundary="taper")
 
 
 def restore_files(arguments: argparse.Namespace) -> RestoredImages:

@@ -27,30 +27,38 @@ A phase element at the stop, whose heights are learned with the lens, or an elem
 
     camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.imaging.PhaseVariables(element), sensor=sensor)
     camera = rt.Camera(rt.imaging.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
+
+Of an element alone the pictures may be periods of an endless one, without a border:
+
+    camera = rt.Camera(…, boundary="circular", normalise="haze", filter=DepthInvariantFilter(spectrum, distances))
 """
 
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar, get_args
 
 import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.field_kernels import (
+    ElementKernels,
+    FieldKernels,
     Model,
+    Normalisation,
     by_angle,
     check_model,
     check_points,
-    field_kernels,
     has_points,
     order_of,
     warn_of_dark_places,
 )
-from raytrace.imaging.image import as_picture, blur, linearised
+from raytrace.imaging.filters import LinearFilter
+from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions, with_haze
 from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
+from raytrace.imaging.restoration import restore
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.result import plain
@@ -63,6 +71,8 @@ from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.plan import Plan
+from raytrace.wave_optics.plan import plan as sampling_plan
 from raytrace.words import named_value
 
 #: The variables of a camera: of a lens, or of a phase element without one.
@@ -78,7 +88,7 @@ class Camera(nn.Module, Generic[V]):
     or (H, W) for all object distances.
 
     variables: of the lens, or of a phase element without a lens, `sensor_distance` mm before the sensor, at wavelengths
-    (W,) µm as for `render`; element: variables of one at the stop of the lens.
+    (W,) µm as for `render`, by the true spheres with `exact`; element: variables of one at the stop of the lens.
     network: (B, C, h, w) -> the same; sensor: gives the images its response, noise, quantisation and mosaic; by
     default `rt.Sensor()`, grey and without noise. Whole pictures: see `render`.
     model: a PSF model or its name, by default "gaussian", with elements "wave". Gaussian(rays=points) and
@@ -88,10 +98,15 @@ class Camera(nn.Module, Generic[V]):
     and of 1 of its half diagonal, whose images stay at these points of it; without a sensor the axis.
     pixels: of the sensor across the PSF window, an odd number, 21 by default.
     center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): a displaced image is no
-    error. normalise: "window" (PSFs of sum 1) or "energy" (of the share of the light through the entrance pupil);
-    illumination: images have the relative illumination of their places, too.
+    error. normalise: "window" (PSFs of sum 1) or "energy" (of the share of the light through the entrance pupil); with
+    elements alone also "haze": "energy", and the light beyond the window is spread evenly over the image.
+    boundary: of pictures, as for `blur`: "valid", images are smaller by `margin`; "circular", pictures are periods of
+    an endless one; or they are extended. illumination: images have the relative illumination of their places, too.
+    filter: of elements alone, a linear filter of the image before the network, that follows from the kernels of its
+    distances (`filters`).
     tol: allowed error of the kernels: the order of the PSF model is chosen once, for the lens at the first call
-    (`plan`). network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
+    (`plan`); with elements alone every call has a sampling of its own until `plan` fixes it.
+    network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
     tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens for
     each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
@@ -103,6 +118,8 @@ class Camera(nn.Module, Generic[V]):
     variables: V
     element: PhaseVariables | None
     network: nn.Module
+    filter: LinearFilter | None
+    _sampling: Plan | None
     psf_parameters: Model | None
 
     def __init__(
@@ -114,13 +131,16 @@ class Camera(nn.Module, Generic[V]):
         element: PhaseVariables | None = None,
         sensor_distance: float | None = None,
         wavelengths: Sequence[float] | None = None,
+        exact: bool = False,
         model: str | Model | None = None,
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
         pixels: int = 21,
         center: Literal["chief", "centroid"] = "chief",
-        normalise: Literal["window", "energy"] = "window",
+        normalise: Normalisation = "window",
+        boundary: Literal["valid", "circular", "zero", "reflect", "taper"] = "valid",
         illumination: bool = False,
+        filter: LinearFilter | None = None,
         tol: float = 1e-2,
         network_dtype: torch.dtype | None = None,
         tolerances: ToleranceTable | None = None,
@@ -132,7 +152,8 @@ class Camera(nn.Module, Generic[V]):
             raise TypeError(f"Camera: `variables` is {kind}; expected {expected}")
         self.variables, self.element, self.network = variables, element, network
         self.range, self.sensor, self.illumination = object_distances, sensor or Sensor(), illumination
-        self.sensor_distance, self.wavelengths = sensor_distance, wavelengths
+        self.sensor_distance, self.wavelengths, self.exact = sensor_distance, wavelengths, exact
+        self.boundary, self.filter = boundary, filter
         self._check_element()
         with torch.no_grad():
             lens = self.lens()
@@ -159,6 +180,9 @@ class Camera(nn.Module, Generic[V]):
             raise ValueError(f"a camera {'of an element without' if is_alone else 'with'} a lens: {needed}")
         if self.wavelengths is not None and not is_alone:
             raise ValueError("wavelengths of a camera with a lens: give lens.at(wavelengths=…)")
+        if not is_alone and (self.exact or self.filter is not None):
+            option = "exact" if self.exact else "filter"
+            raise ValueError(f"{option} of a camera with a lens: expected an element alone; leave {option} out")
 
     def lens(self) -> Lens:
         """The current lens; of an element without one, the stop that it is in."""
@@ -166,17 +190,18 @@ class Camera(nn.Module, Generic[V]):
             return self.variables()
         return element_in_stop(self.variables(), self.sensor, self.sensor_distance, self.wavelengths)
 
-    def elements(self) -> tuple[Element, ...]:
-        """The current phase elements, in contact."""
+    def elements(self, *, draw: torch.Generator | None = None) -> tuple[Element, ...]:
+        """The current phase elements, in contact; draw: generator of errors of fabrication."""
         element = self.variables if isinstance(self.variables, PhaseVariables) else self.element
-        return () if element is None else element()
+        return () if element is None else element(draw=draw)
 
     def _check(self) -> None:
         """Refuse options that cannot be simulated. Raises ValueError, BadTolerance."""
         check_model(self.model, self.elements())
         for name, word, known in (
             ("center", self.center, ("chief", "centroid")),
-            ("normalise", self.normalise, ("window", "energy")),
+            ("normalise", self.normalise, get_args(Normalisation)),
+            ("boundary", self.boundary, BOUNDARIES),
         ):
             if word not in known:
                 raise ValueError(f"{name} {word!r}: expected {' or '.join(known)}")
@@ -184,10 +209,15 @@ class Camera(nn.Module, Generic[V]):
             raise ValueError(f"pixels {self.size!r}: expected an odd number of pixels of the sensor")
         if self.center == "centroid" and has_points(self.psf_parameters):
             raise ValueError("windows of the rays of pupil points are about the chief ray: give center chief")
-        if self.elements() and (self.center, self.normalise) != ("chief", "window"):
+        if self.elements() and self.center != "chief":
+            raise ValueError("windows of a phase element are about the chief ray: leave center out")
+        if self.element is not None and self.normalise != "window":
             raise ValueError(
-                "windows of a phase element are about the chief ray, of sum 1: leave center, normalise out"
+                f"normalise {self.normalise!r} with a phase element at the stop of a lens: leave it out; windows have "
+                "sum 1"
             )
+        if self.normalise == "haze" and (self.illumination or not isinstance(self.variables, PhaseVariables)):
+            raise ValueError("normalise 'haze': expected an element without a lens, and no illumination")
         if self.tolerances is None:
             return
         if self.elements() or not isinstance(self.variables, Variables):
@@ -259,7 +289,7 @@ class Camera(nn.Module, Generic[V]):
     @property
     def margin(self) -> int:
         """Rows and columns by which the PSF window shrinks an image."""
-        return self.size - 1
+        return self.size - 1 if self.boundary == "valid" else 0
 
     def use(self, model: str | Model) -> None:
         """Simulate with another PSF model, given by its name or with its parameters."""
@@ -267,7 +297,7 @@ class Camera(nn.Module, Generic[V]):
             self.model, self.psf_parameters = model, None if model not in MODELS else model_of(model)
         else:
             self.model, self.psf_parameters = name_of(model), model
-        self._order = getattr(self.psf_parameters, "order", None)
+        self._order, self._sampling = getattr(self.psf_parameters, "order", None), None
         self._check()
 
     def as_built(self, errors: Tensor | Sequence[float]) -> Lens:
@@ -280,10 +310,17 @@ class Camera(nn.Module, Generic[V]):
         return lens_as_built(lens, self.tolerances, errors, self.fields)
 
     @torch.no_grad()
-    def plan(self) -> int:
-        """The order of the PSF model that meets the tolerance at the ends and the middle of the range."""
+    def plan(self, object_distances: Tensor | Sequence[float] | None = None) -> int:
+        """The order of the PSF model that meets the tolerance at object distances (Z,) mm.
+
+        By default at the ends and the middle of the range. With elements alone their sampling is fixed; the order is 0.
+        """
         near, far = self.range
-        distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
+        usual = (near, 2 / (1 / near + 1 / far), far)
+        distances = self._distances(usual if object_distances is None else object_distances)
+        if isinstance(self.variables, PhaseVariables):
+            self._sampling = sampling_plan(self.element_kernels(distances).scene)
+            return 0
         lens = self.lens()
         if self.tolerances is not None:
             lens = self.as_built(draw_errors(self.tolerances, len(distances)))
@@ -296,6 +333,16 @@ class Camera(nn.Module, Generic[V]):
             )  # fmt: skip
         return self._order
 
+    def element_kernels(
+        self, object_distances: Tensor | Sequence[float], *, draw: torch.Generator | None = None
+    ) -> ElementKernels:
+        """Kernels of the current elements without a lens, at object distances (D,) mm; draw: as for `elements`."""
+        distances, elements = self._distances(object_distances), self.elements(draw=draw)
+        lens = element_in_stop(elements, self.sensor, self.sensor_distance, self.wavelengths)
+        weights = self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
+        numbers = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
+        return ElementKernels(lens, elements, *numbers)
+
     def kernels(
         self,
         object_distances: Tensor | Sequence[float] | float,
@@ -303,13 +350,15 @@ class Camera(nn.Module, Generic[V]):
         errors: Tensor | None = None,
         *,
         points: Tensor | None = None,
+        draw: torch.Generator | None = None,
     ) -> Tensor:
         """PSFs (B, C, rows, columns) of object distances (B,) mm, of the channels of the sensor.
 
         object_distances: a tensor, a sequence or one number. field: number of one of the camera's `fields`, or (B,)
         numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N);
         the object points are those that the nominal lens images at these places. PSFs are 0 where no light arrives,
-        with the warning DarkPlaces. Raises ValueError for points that are not finite.
+        with the warning DarkPlaces. draw: of an element alone, generator of errors of fabrication. Raises ValueError
+        for points that are not finite.
         """
         distances, nominal = self._distances(object_distances), self.lens()
         lens, count = nominal, len(distances)
@@ -318,20 +367,24 @@ class Camera(nn.Module, Generic[V]):
         if points is not None:
             check_points(points, count)
             points, lens = points.to(self.fields), by_angle(nominal)
-        about = field_kernels(
-            lens,
-            self.sensor,
-            self.model,
-            self.plan() if self._order is None else self._order,
-            self.size,
-            distances,
-            self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances),
-            elements=self.elements(),
-            parameters=self.psf_parameters,
-            center=self.center,
-            normalise=self.normalise,
-            memo=self._memo if points is None and errors is None else None,
-        )
+        about: FieldKernels | ElementKernels
+        if isinstance(self.variables, PhaseVariables):
+            about = self.element_kernels(distances, draw=draw)
+        else:
+            about = FieldKernels(
+                lens,
+                self.sensor,
+                self.model,
+                self.plan() if self._order is None else self._order,
+                self.size,
+                distances,
+                self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances),
+                elements=self.elements(),
+                parameters=self.psf_parameters,
+                center=self.center,
+                normalise=self.normalise,
+                memo=self._memo if points is None and errors is None else None,
+            )
         if errors is None and points is not None:
             kernels = about.paired(points)
         else:
@@ -360,15 +413,21 @@ class Camera(nn.Module, Generic[V]):
         """Places (2, B), of the camera's (2, F), at one number of a field, or at one for each of B images."""
         return places[:, torch.as_tensor(field, device=places.device).expand(count)]
 
-    def kernels_over_field(self, object_distances: Tensor, points: Tensor | None = None) -> Tensor:
+    def kernels_over_field(
+        self,
+        object_distances: Tensor | Sequence[float],
+        points: Tensor | None = None,
+        *,
+        draw: torch.Generator | None = None,
+    ) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at the camera's fields, or at points (2, N) mm."""
         distances = self._distances(object_distances)
         count = self.fields.shape[1] if points is None else points.shape[1]
         each, places = distances.repeat_interleave(count), [*range(count)] * len(distances)
         if points is None:
-            kernels = self.kernels(each, places)
+            kernels = self.kernels(each, places, draw=draw)
         else:
-            kernels = self.kernels(each, points=points.to(distances)[:, places])
+            kernels = self.kernels(each, points=points.to(distances)[:, places], draw=draw)
         return kernels.unflatten(0, (len(distances), -1))
 
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
@@ -382,13 +441,13 @@ class Camera(nn.Module, Generic[V]):
     def image(
         self,
         picture: Tensor,
-        object_distances: Tensor,
+        object_distances: Tensor | Sequence[float] | float,
         field: int | Sequence[int] = 0,
         errors: Tensor | None = None,
         *,
         points: Tensor | None = None,
     ) -> Tensor:
-        """The noise-free sensor image, (B, C, H - margin, W - margin).
+        """The noise-free sensor image, (B, C, H - margin, W - margin); the margin is 0 unless the boundary is "valid".
 
         picture: (B, C, H, W) in [0, 1], centred at the places that field, points and errors give, as for `kernels`;
         integers of 8 or 16 bits are levels of sRGB (`linearised`). Pictures of half precision are blurred in float32,
@@ -396,9 +455,20 @@ class Camera(nn.Module, Generic[V]):
         """
         distances = self._distances(object_distances)
         picture = self._of_channels(picture, distances)
-        kernels = self.kernels(distances, field, errors, points=points)
-        light = picture.to(torch.promote_types(picture.dtype, torch.float32))
-        return blur(light, kernels.to(light.dtype))
+        return self.blurred(picture, self.kernels(distances, field, errors, points=points))
+
+    def blurred(self, light: Tensor, kernels: Tensor) -> Tensor:
+        """Light (B, C, H, W) behind kernels (B, C, h, w) of the camera, continued by its boundary, with its haze."""
+        light = light.to(torch.promote_types(light.dtype, torch.float32))
+        kernels = kernels.to(light.dtype)
+        image = blur(light, kernels, boundary=self.boundary)
+        if self.normalise != "haze":
+            return image
+        return image + (1 - kernels.sum((-2, -1), keepdim=True)) * light.mean((-2, -1), keepdim=True)
+
+    def of_period(self, kernels: Tensor, size: int | Sequence[int]) -> Tensor:
+        """Kernels (..., h, w) of the camera for closed forms and filters of this size: with haze over a period."""
+        return with_haze(kernels, size) if self.normalise == "haze" else kernels
 
     def _of_channels(self, picture: Tensor, distances: Tensor) -> Tensor:
         """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,). Raises ValueError."""
@@ -435,11 +505,23 @@ class Camera(nn.Module, Generic[V]):
         options = {"sensor": self.sensor, "model": self.model, **options}
         if not isinstance(self.variables, PhaseVariables):
             return render(self.variables(), scene, depth=depth, elements=self.elements(), **options)
+        if self.exact:
+            raise ValueError(
+                "render of a camera with exact spheres: pictures are computed by paraboloids; leave exact out"
+            )
         alone = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "size": self.size}
         return render(self.elements(), scene, depth=depth, **{**alone, **options})
 
-    def restore(self, image: Tensor) -> Tensor:
-        """The network's estimate (B, C, h, w) from a noisy image."""
+    def restore(self, image: Tensor, kernels: Tensor | None = None) -> Tensor:
+        """The estimate (B, C, h, w) of filter and network from a noisy image.
+
+        kernels: (Z, C, h, w) of the distances of the filter, if they are known.
+        """
+        if self.filter is not None:
+            kernels = self.kernels(self.filter.distances) if kernels is None else kernels
+            size = self.filter.spectrum.shape[-2:]
+            G = self.filter(transfer_functions(self.of_period(kernels, size), size), self.sensor)
+            image = restore(image, G, boundary="circular" if self.boundary == "circular" else "taper")
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
             image = as_picture(image, "image")
             like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
@@ -448,7 +530,7 @@ class Camera(nn.Module, Generic[V]):
     def forward(
         self,
         picture: Tensor,
-        object_distances: Tensor,
+        object_distances: Tensor | Sequence[float] | float,
         *,
         field: int | Sequence[int] = 0,
         errors: Tensor | None = None,
@@ -482,8 +564,7 @@ class Camera(nn.Module, Generic[V]):
 
     def target(self, picture: Tensor) -> Tensor:
         """The ideal output (B, C, h, w): the light of the picture without its margin."""
-        edge = self.size // 2
-        light = self._light(picture)
+        edge, light = self.margin // 2, self._light(picture)
         return light[..., edge : light.shape[-2] - edge, edge : light.shape[-1] - edge]
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.image import decoded, transfer_functions
 from raytrace.imaging.lens_steps import LensSteps
+from raytrace.imaging.octant import octant_error
 from raytrace.imaging.pictures import Pictures, crop
 from raytrace.imaging.restoration import (
     cross_spectrum,
@@ -22,7 +23,7 @@ from raytrace.imaging.restoration import (
     kernel_error,
     power_spectrum,
 )
-from raytrace.imaging.variables import Variables
+from raytrace.imaging.variables import PhaseVariables, Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.least_squares import TensorDescent
@@ -53,32 +54,32 @@ def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int =
     return total / count
 
 
-def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
+def camera_error(
+    camera: Camera, spectrum: Tensor, distances: Tensor | Sequence[float], *, draw: torch.Generator | None = None
+) -> Tensor:
     """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
 
-    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the lens. The mean over the
-    channels of the sensor and the camera's fields, each with a filter of its own; with cross spectra (C, C, rows,
-    columns) the filter of each field is joint, `joint_wiener`.
+    spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the camera. The mean over
+    the channels of the sensor and the camera's fields, each with a filter of its own; with cross spectra (C, C, rows,
+    columns) the filter of each field is joint, `joint_wiener`. draw: of an element alone, generator of errors of
+    fabrication. Round elements whose sampling is fixed (`Camera.plan`) need an eighth of the frequencies (`octant`).
     """
-    kernels, spectrum = camera.kernels_over_field(distances), spectrum.to(camera.fields.device)
-    sigma = noise_deviation(camera, spectrum)
+    spectrum = spectrum.to(camera.fields.device)
+    sigma = camera.sensor.noise_deviation(spectrum)
+    if isinstance(camera.variables, PhaseVariables) and camera.normalise == "haze":
+        error = octant_error(camera.element_kernels(distances, draw=draw), spectrum, sigma)
+        if error is not None:
+            return error
+    kernels = camera.of_period(camera.kernels_over_field(distances, draw=draw), spectrum.shape[-2:])
     if spectrum.dim() == 4:
         return joint_kernel_error(kernels, spectrum, sigma).mean()
     return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
 
 
-def noise_deviation(camera: Camera, spectrum: Tensor) -> Tensor:
-    """Standard deviation of the noise of a pixel of mean level, (C, 1, 1) of every channel, or (1, 1) of all."""
-    rows, columns = spectrum.shape[-2:]
-    constant = spectrum[..., 0, 0]
-    mean = ((constant.diagonal().real if spectrum.dim() == 4 else constant) / (rows * columns)).sqrt()
-    well, read = camera.sensor.full_well, camera.sensor.read_noise
-    variance = torch.full_like(mean, read**2) if well is None else mean / well + (read / well) ** 2
-    return variance.sqrt()[..., None, None]
-
-
 @torch.no_grad()
-def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], distances: Tensor | None = None) -> Tensor:
+def field_filters(
+    camera: Camera, spectrum: Tensor, places: Sequence[float], distances: Tensor | Sequence[float] | None = None
+) -> Tensor:
     """Depth-invariant Wiener filters (N, C, rows, columns) of a sensor's channels at places on its diagonal; joint ones
     (N, C, C, rows, columns) for cross spectra (C, C, rows, columns).
 
@@ -88,10 +89,10 @@ def field_filters(camera: Camera, spectrum: Tensor, places: Sequence[float], dis
     distances = even_distances(camera) if distances is None else distances
     spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
-    transfer = transfer_functions(kernels, spectrum.shape[-2:])
+    transfer = transfer_functions(camera.of_period(kernels, spectrum.shape[-2:]), spectrum.shape[-2:])
     if spectrum.dim() == 4:
-        return joint_wiener(transfer, spectrum, noise_deviation(camera, spectrum))
-    return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), noise_deviation(camera, spectrum))
+        return joint_wiener(transfer, spectrum, camera.sensor.noise_deviation(spectrum))
+    return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), camera.sensor.noise_deviation(spectrum))
 
 
 def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:

@@ -360,13 +360,8 @@ def optimise(
     groups: list[dict[str, Any]] = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
     optimizer, steps = torch.optim.Adam(groups), settings.epochs * batches.steps_per_epoch
-    rates = [group["lr"] for group in groups]
 
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        # A function of the step alone, so that a resumed run has the same rates.
-        decay = 0.5 * (1 + math.cos(math.pi * step / steps)) if settings.decay == "cosine" else 1.0
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * decay
         return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
 
     return train(
@@ -378,6 +373,7 @@ def optimise(
         every=every,
         after_step=camera.variables.project,
         penalty=camera.variables.violation,
+        schedule="cosine" if settings.decay == "cosine" else None,
     )
 
 

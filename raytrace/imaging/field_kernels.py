@@ -17,7 +17,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -55,6 +55,8 @@ from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
+#: Kernels of sum 1; or of the share of all light, of which the part beyond the window is lost, or returns as even haze.
+Normalisation: TypeAlias = Literal["window", "energy", "haze"]
 #: A PSF model with its numbers.
 Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
 
@@ -87,7 +89,7 @@ class FieldKernels:
     where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
     traced; elements: in contact at the stop, with the model "wave"; parameters: of the model, as Paraxial(rho=0.4), or
     Gaussian(rays=points), pupil points in place of an order; center: of the window, "chief" or "centroid" (of the
-    light); normalise: "window", kernels of sum 1, or "energy", of the share of the light through the entrance pupil;
+    light); normalise: "window", kernels of sum 1, or of the share of the light through the entrance pupil;
     memo: of rays, for loops over the same field points. Raises ValueError for elements and another model.
     """
 
@@ -103,7 +105,7 @@ class FieldKernels:
     elements: tuple[Element, ...] = ()
     parameters: Model | None = None
     center: Literal["chief", "centroid"] = "chief"
-    normalise: Literal["window", "energy"] = "window"
+    normalise: Normalisation = "window"
     memo: Memo | None = None
 
     def __post_init__(self) -> None:
@@ -219,7 +221,7 @@ class FieldKernels:
                 part = part.detach().requires_grad_()
             light = self.light(part, origin) if self.elements else self._of_model(part, origin)
             light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
-            kernels.append(light if self.normalise == "energy" else _of_sum_1(light))
+            kernels.append(_of_sum_1(light) if self.normalise == "window" else light)
         return torch.cat(kernels)
 
     def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
@@ -332,7 +334,8 @@ class ElementKernels:
     """Kernels of elements alone, the same at every place of the sensor, as `FieldKernels` of a lens.
 
     lens: `stop_alone`, the stop of the elements and the sensor distance; other arguments as for `FieldKernels`.
-    plan: the sampling, of an earlier call: for loops; memo: of sums that do not depend on the heights.
+    exact: the true spheres instead of Fresnel's paraboloids; plan: the sampling, of an earlier call: for loops; memo:
+    of sums that do not depend on the heights.
     """
 
     lens: Lens
@@ -341,6 +344,8 @@ class ElementKernels:
     size: int
     object_distances: Tensor
     weights: Tensor
+    exact: bool = False
+    normalise: Normalisation = "window"
     plan: Plan | None = None
     memo: Memo | None = None
 
@@ -348,7 +353,8 @@ class ElementKernels:
     def scene(self) -> WaveScene:
         sensor_distance = self.lens.surfaces[-2].thickness
         window = make_grid(sensor_distance.new_tensor(self.sensor.pitch), self.size)
-        return WaveScene(self.elements, sensor_distance, self.object_distances, self.lens.wavelengths, window)
+        wavelengths = self.lens.wavelengths
+        return WaveScene(self.elements, sensor_distance, self.object_distances, wavelengths, window, self.exact)
 
     def light(self) -> Tensor:
         """Light (D, W, h, w) in each pixel, columns towards +x; 1 = all through the aperture."""
@@ -360,9 +366,9 @@ class ElementKernels:
         return light.sum((-2, -1)) @ self.weights.to(light).T
 
     def of_light(self, light: Tensor) -> Tensor:
-        """Kernels (D, C, size, size) of sum 1 of `light`."""
+        """Kernels (D, C, size, size) of `light`."""
         kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
-        return _of_sum_1(kernels)
+        return _of_sum_1(kernels) if self.normalise == "window" else kernels
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
@@ -372,7 +378,7 @@ class ElementKernels:
     def paired(self, points: Tensor) -> Tensor:
         """Kernels (N, C, size, size) of pairs: places (2, N) mm, each with its object distance of (N,)."""
         distances, which = _distinct(self.object_distances)
-        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0, which]
+        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0].index_select(0, which)
 
     def of_pairs(self, fields: Tensor) -> Tensor:
         """`paired` of field points (2, N)."""
@@ -416,19 +422,13 @@ def field_kernels(
     weights: Tensor,
     lateral_colour: bool = True,
     elements: Sequence[Element] = (),
-    **more: Any,
 ) -> FieldKernels | ElementKernels:
-    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone.
-
-    more: further fields of `FieldKernels`.
-    """
+    """Kernels over the sensor: of a lens, with elements at its stop, or of elements behind a stop alone."""
     elements = tuple(elements)
     if elements and is_stop_alone(lens):
         check_model(model, elements)
         return ElementKernels(lens, elements, sensor, size, object_distances, weights)
-    return FieldKernels(
-        lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements, **more
-    )
+    return FieldKernels(lens, sensor, model, order, size, object_distances, weights, lateral_colour, elements=elements)
 
 
 def has_points(parameters: Model | None) -> bool:

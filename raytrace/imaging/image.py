@@ -121,6 +121,19 @@ def transfer_functions(kernels: Tensor, size: int | Sequence[int], *, origin: st
     return transfer if origin == "pixel" else transfer * _half_pixels(kernels, shape)
 
 
+def with_haze(kernels: Tensor, size: int | Sequence[int]) -> Tensor:
+    """Kernels (..., rows, columns) of a whole periodic image: the light beyond their window, 1 - Σ h, is an even haze.
+
+    kernels: (..., h, w), of the share of all light. Their transfer functions are 1 at frequency 0.
+    """
+    rows, columns = (size, size) if isinstance(size, int) else size
+    h, w = kernels.shape[-2:]
+    check_fit((h, w), (rows, columns))
+    top, left = rows // 2 - h // 2, columns // 2 - w // 2
+    beyond = 1 - kernels.sum((-2, -1), keepdim=True)
+    return torch.nn.functional.pad(kernels, (left, columns - w - left, top, rows - h - top)) + beyond / (rows * columns)
+
+
 def extend(picture: Tensor, shape: Sequence[int], *, boundary: str) -> Tensor:
     """Images (..., H, W) extended to `shape`, one period of the continuation.
 

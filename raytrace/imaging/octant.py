@@ -12,11 +12,14 @@ import math
 import torch
 from torch import Tensor
 
+from raytrace.imaging.field_kernels import ElementKernels
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.restoration import depth_invariant_density
 from raytrace.maths.sampling import grid
 from raytrace.psf_models.radial import radii_of_waves, reach, unfold
 from raytrace.wave_optics import propagation
+from raytrace.wave_optics.compute import remembered
+from raytrace.wave_optics.element import Rings
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene, spheres
 
@@ -53,12 +56,31 @@ class Octant:
         H = (light.flatten(0, 1) @ self._to_octant.T).unflatten(0, light.shape[:2]).to(self._r.dtype)
         return torch.cat([torch.ones_like(H[..., :1]), H[..., 1:]], -1)
 
-    def error(self, scene: WaveScene, spectrum: Tensor, noise: float) -> Tensor:
-        """Mean square error behind the best depth-invariant filter, mean over colours; spectrum: S (size, size) of
-        pictures that equal their mirror images."""
+    def error(self, transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+        """Mean square error behind the best depth-invariant filter, mean over channels; transfer: (D, C, F); spectrum:
+        S (size, size) of pictures that equal their mirror images."""
         both = torch.stack([spectrum[self._rows, self._columns], spectrum[self._columns, self._rows]])
-        density = depth_invariant_density(self.transfer(scene)[:, :, None], both, noise)
+        density = depth_invariant_density(transfer[:, :, None], both, sigma)
         return (self._weight * density).sum((-2, -1)).mean()
+
+
+def octant_error(kernels: ElementKernels, spectrum: Tensor, sigma: Tensor) -> Tensor | None:
+    """`Octant.error` of elements with haze; None where the octant is not enough, or their sampling is not fixed."""
+    scene, plan = kernels.scene, kernels.plan
+    if plan is None or kernels.memo is None or spectrum.dim() > 2:
+        return None
+
+    def octant() -> Octant | None:
+        # Rings in single precision: their sums take most of the time, and Adam needs no more.
+        is_rings = isinstance(scene.elements[0].profile, Rings)
+        dtype = torch.float32 if is_rings else torch.float64
+        return Octant(scene, plan, spectrum.shape[-1], dtype=dtype) if fits(scene, plan, spectrum) else None
+
+    part = remembered(kernels.memo, scene, ("octant", plan), octant, spectrum)
+    if part is None:
+        return None
+    transfer = torch.einsum("cw,dwf->dcf", kernels.weights, part.transfer(scene))
+    return part.error(transfer, spectrum, sigma)
 
 
 def _between(places: Tensor, count: int) -> Tensor:

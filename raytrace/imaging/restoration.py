@@ -68,9 +68,15 @@ def depth_invariant_wiener(transfer: Tensor, spectrum: Tensor, sigma: Tensor | f
 
 
 def errors(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float, *, filter: Tensor | None = None) -> Tensor:
-    """Mean square error (Z, ...) of a pixel for each transfer function; filter: the depth-invariant one by default."""
+    """Mean square error (Z, ...) of a pixel for each transfer function; filter: the depth-invariant one by default.
+
+    Of many spectra (B, 1, ..., rows, columns) behind one filter (B, Z, ...), without a product of their size.
+    """
     G = depth_invariant_wiener(transfer, spectrum, sigma) if filter is None else filter
-    return (spectrum * _square(G * transfer - 1) + sigma**2 * _square(G)).mean((-2, -1))
+    left = _square(G * transfer - 1)
+    power = spectrum + left.new_zeros(left.shape[-2:])
+    remaining = torch.einsum("...ij,...ij->...", power, left.to(power.dtype)) / math.prod(left.shape[-2:])
+    return remaining + (sigma**2 * _square(G)).mean((-2, -1))
 
 
 def depth_invariant_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:

@@ -309,6 +309,18 @@ class Sensor:
         black = _BLACK * self.read_noise if self.black_level is None else self.black_level
         return black / (self.full_well or 1.0)
 
+    def noise_deviation(self, spectrum: Tensor) -> Tensor:
+        """Standard deviation of the noise of a pixel of mean level, (1, 1), of pictures of a spectrum (rows, columns).
+
+        (C, 1, 1) of spectra (C, rows, columns) of channels and of cross spectra (C, C, rows, columns).
+        """
+        rows, columns = spectrum.shape[-2:]
+        constant = spectrum[..., 0, 0]
+        mean = ((constant.diagonal().real if spectrum.dim() == 4 else constant) / (rows * columns)).sqrt()
+        well, read = self.full_well, self.read_noise
+        variance = torch.full_like(mean, read**2) if well is None else mean / well + (read / well) ** 2
+        return variance.sqrt()[..., None, None]
+
     def _noisy(self, picture: Tensor, generator: torch.Generator) -> Tensor:
         """A picture (C, H, W) with shot and read noise."""
         if self.full_well is not None:

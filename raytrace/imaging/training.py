@@ -35,6 +35,14 @@ _ANEW = "remove it to begin anew"
 Record = dict[str, float]
 
 
+#: Factors of learning rates at a part (0 to 1) of the steps: functions of the step alone, so that runs resume.
+SCHEDULES: dict[str, Callable[[float], float]] = {
+    "constant": lambda part: 1.0,
+    "linear": lambda part: 1 - part,
+    "cosine": lambda part: 0.5 * (1 + math.cos(math.pi * part)),
+}
+
+
 class NotFinite(RaytraceError, ArithmeticError, ValueError):
     """A loss or a gradient is not finite; the run stops, its last checkpoint remains."""
 
@@ -168,16 +176,19 @@ def train(
     seconds: float = 60.0,
     after_step: Callable[[], None] = lambda: None,
     penalty: Callable[[], Tensor] | None = None,
+    schedule: str | None = None,
 ) -> Iterator[tuple[int, Record]]:
     """The remaining steps, each taken when its item is taken from the iterator: (step, record of the log).
 
     loss: (step, share of this process) -> its part of the loss of the batch, to be summed over processes, and numbers
     for the log (of the first process); every, seconds: steps and time between checkpoints, whichever passes first;
     after_step: for example a projection; penalty: minimised together with the loss, equal in all processes. It is added
-    for the gradient alone: the log has it in its own column.
+    for the gradient alone: the log has it in its own column. schedule: of the learning rates of the optimiser, one of
+    SCHEDULES; by default `loss` may set them.
     Raises NotFinite for a loss or a gradient that is not finite, before the step.
     """
     prepare()  # numbers must not depend on the moment at which the trace is compiled
+    rates = [group["lr"] for group in optimizer.param_groups]  # before a checkpoint sets those of its step
     state, mine, saved_at = run.load(), share(), time.monotonic()
     step = 0 if state is None else load_state(module, state, run.checkpoint, optimizer)
     if mine.rank == 0:
@@ -185,6 +196,9 @@ def train(
     rows: list[tuple[int, Record]] = []
     parameters = [p for p in module.parameters() if p.requires_grad]
     while step < steps:
+        if schedule is not None:
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * SCHEDULES[schedule](step / steps)
         optimizer.zero_grad(set_to_none=True)
         value, record = loss(step, mine)
         added = None if penalty is None else penalty()

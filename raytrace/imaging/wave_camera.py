@@ -1,4 +1,4 @@
-"""A camera with a phase element and a linear filter for extended depth of field: its kernels, errors and image quality.
+"""Cameras with a phase element alone for extended depth of field: their numbers, pictures and image quality.
 
 Pictures are periodic (mirrored to twice their size, without a jump at the border), each at one depth. Light outside the
 window of the kernel is not lost: it is even haze over the whole picture. Two filters restore them: the Wiener filter of
@@ -6,23 +6,24 @@ the design depth with the best constant γ, and the best depth-invariant one ("b
 """
 
 import dataclasses
-import functools
 import math
 import warnings
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, Self, cast
 
 import numpy as np
 import scipy.optimize
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from raytrace.imaging.image import transfer_functions
-from raytrace.imaging.octant import Octant, fits
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import extend, transfer_functions
 from raytrace.imaging.pictures import Pictures
-from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, power_spectrum, psnr, wiener
+from raytrace.imaging.sensor import Sensor
+from raytrace.imaging.spectral_response import SpectralResponse
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.result import Result
-from raytrace.maths.sampling import grid
 from raytrace.optimization.least_squares import NoOptimum
 from raytrace.plotting.style import (
     FIELD_COLOURS,
@@ -35,21 +36,17 @@ from raytrace.plotting.style import (
     styled,
     wavelength_colours,
 )
-from raytrace.tracing.scene import Memo
-from raytrace.wave_optics.compute import ElementPsf, psf, psf_by_depth
 from raytrace.wave_optics.element import Element, height
-from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.scene import WaveScene
 
 FILTERS = ("wiener", "blind")  # of restoration
-WAVELENGTH = 0.55  # µm, at which elements are designed and wrapped
+_SIDE = 512  # pixels of the sensor along a side
 _BLACK = 1e-5  # of the brightest pixel of a row of kernels
 _TALL = 10.0  # µm of height, many waves, beyond which the texture is drawn as a difference
 
 
 @dataclasses.dataclass(frozen=True)
 class WaveCameraConfig:
-    """Lengths in mm, wavelengths in µm.
+    """Numbers of a camera with an element alone. Lengths in mm, wavelengths in µm.
 
     depths: of the objects; design: the depth whose kernel the Wiener filter inverts; pixel, size: of the window of the
     kernels, an odd number, so that no picture is shifted; noise: standard deviation, for pictures in [0, 1].
@@ -65,41 +62,38 @@ class WaveCameraConfig:
     noise: float = 0.01
     exact: bool = False
 
+    @property
+    def sensor(self) -> Sensor:
+        """A sensor with a channel for each wavelength, and white noise."""
+        ascending, response = sorted(self.wavelengths), None
+        if len(ascending) > 1:
+            channels = [[float(known == wavelength) for known in ascending] for wavelength in self.wavelengths]
+            response = SpectralResponse(ascending, channels)
+        side, pixels = _SIDE * self.pixel, (_SIDE, _SIDE)
+        return Sensor((side, side), pixels, response=response, read_noise=self.noise, saturation=math.inf)
+
+    def camera(
+        self, elements: Sequence[Element] | PhaseVariables, network: nn.Module | None = None, **options: Any
+    ) -> Camera[PhaseVariables]:
+        """The camera of constant elements in contact, or of variables; without a network; options: of `Camera`."""
+        if not isinstance(elements, PhaseVariables):
+            first, *others = elements
+            elements = PhaseVariables(first, others=others).requires_grad_(False)
+        optics = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "exact": self.exact}
+        window = {"pixels": self.size, "normalise": "haze", "boundary": "circular", "fields": [0]}
+        near_to_far = min(self.depths), max(self.depths)
+        numbers: dict[str, Any] = {"sensor": self.sensor, "object_distances": near_to_far} | optics | window
+        return Camera(elements, network or nn.Identity(), **(numbers | options))
+
 
 def depth_text(depth: float, infinity: str = "infinity") -> str:
     """A depth in mm as text, in m."""
     return infinity if math.isinf(depth) else f"{1e-3 * depth:.3g} m"
 
 
-def scene(elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequence[float] | None = None) -> WaveScene:
-    """The camera's objects, through elements in contact; depths: mm, other than its own."""
-    like = elements[0].radius
-    return WaveScene(
-        elements=tuple(elements),
-        sensor_distance=like.new_tensor(config.sensor_distance),
-        depths=like.new_tensor(config.depths if depths is None else depths),
-        wavelengths=like.new_tensor(config.wavelengths),
-        grid=grid(like.new_tensor(config.pixel), config.size),
-        exact=config.exact,
-    )
-
-
-def kernels(
-    elements: Sequence[Element], config: WaveCameraConfig, *, depths: Sequence[float] | None = None
-) -> ElementPsf:
-    """PSFs of elements, by `psf_by_depth`; depths: mm, other than the camera's own."""
-    return psf_by_depth(scene(elements, config, depths=depths))
-
-
-def transfer(psf: ElementPsf, size: int | Sequence[int]) -> Tensor:
-    """H (D, W, size, size) of kernels normalised by the light through the aperture; light beyond the window is haze."""
-    H = transfer_functions(psf.kernel, size)
-    haze = torch.zeros_like(H.real)
-    haze[..., 0, 0] = 1
-    return H + haze * (1 - psf.energy)[..., None, None]
-
-
-# -- periodic pictures
+def transfer(camera: Camera, size: int, distances: Sequence[float]) -> Tensor:
+    """H (D, C, size, size) of a camera at object distances (D,) mm in its first field, on periodic pictures."""
+    return transfer_functions(camera.of_period(camera.kernels(distances), size), size)
 
 
 def periodic(pictures: Pictures, size: int) -> Tensor:
@@ -110,81 +104,16 @@ def periodic(pictures: Pictures, size: int) -> Tensor:
             raise ValueError(f"a picture of {sample.shape[0]} × {sample.shape[1]} pixels, expected {half} at least")
         row, column = ((n - half) // 2 for n in sample.shape)
         periods.append(mirrored(sample[row : row + half, column : column + half].astype(np.float64) / 255))
-    return torch.as_tensor(np.stack(periods))
+    return torch.stack(periods)
 
 
-def mirrored(picture: np.ndarray) -> np.ndarray:
-    """A picture (h, w) and its mirror images: one period (2h, 2w) without a jump."""
-    picture = np.concatenate([picture, picture[::-1]], 0)
-    return np.concatenate([picture, picture[:, ::-1]], 1)
+def mirrored(picture: np.ndarray) -> Tensor:
+    """A picture (..., h, w) and its mirror images: one period (..., 2h, 2w) without a jump."""
+    h, w = picture.shape[-2:]
+    return extend(torch.as_tensor(picture), (2 * h, 2 * w), boundary="reflect")
 
 
-def spectrum(pictures: Tensor) -> Tensor:
-    """S (size, size) of periodic pictures (B, size, size)."""
-    return power_spectrum(pictures, window="none")
-
-
-def power(picture: Tensor) -> Tensor:
-    """|X|² (n, n) of a periodic picture (n, n), over the number of its pixels."""
-    transformed = torch.fft.fft2(picture)
-    return (transformed.real**2 + transformed.imag**2) / picture.numel()
-
-
-# -- errors of restored pictures
-
-
-def errors_of_pictures(H: Tensor, G: Tensor, noise: float, powers: Tensor) -> Tensor:
-    """Mean square errors (B, D, W) of pictures of `power` (B, n, n) behind filters G, expected over noise."""
-    residual = torch.view_as_real(1 - G * H).square().sum(-1).flatten(2)  # (D, W, n²)
-    added = noise**2 * torch.view_as_real(G).square().sum(-1).mean((-2, -1))
-    return (residual @ powers.flatten(1).T / residual.shape[-1]).movedim(-1, 0) + added
-
-
-def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
-    """Mean square error behind the best depth-invariant filter, in closed form, mean over colours."""
-    return depth_invariant_error(H, S, noise).mean()
-
-
-class ClosedForm:
-    """`expected_error` of elements of one camera, for pictures of spectrum S (n, n); differentiable.
-
-    first: the elements for which the sampling is planned, with the steps of all later ones. Whatever their heights do
-    not change is computed once. dtype: of the sums over a radius.
-    """
-
-    def __init__(
-        self, first: Sequence[Element], config: WaveCameraConfig, S: Tensor, *, dtype: torch.dtype = torch.float64
-    ):
-        self.config, self.S, self._memo, self._dtype = config, S, Memo(), dtype
-        self._first = scene(first, config)
-        self.plan = plan(self._first)
-
-    @functools.cached_property
-    def _octant(self) -> Octant | None:
-        if not fits(self._first, self.plan, self.S):
-            return None
-        return Octant(self._first, self.plan, self.S.shape[-1], dtype=self._dtype)
-
-    def __call__(self, elements: Sequence[Element]) -> Tensor:
-        if self._octant is not None:
-            return self._octant.error(scene(elements, self.config), self.S, self.config.noise)
-        return expected_error(self.transfer(elements), self.S, self.config.noise)
-
-    def transfer(self, elements: Sequence[Element]) -> Tensor:
-        """H (D, W, n, n)."""
-        return transfer(psf(scene(elements, self.config), plan=self.plan, memo=self._memo), self.S.shape[-1])
-
-
-def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Captured and filtered images, each (B, W, N, N), of pictures (B, N, N) at one depth.
-
-    H, G: (W, N, N); noise: (B, W, N, N), added.
-    """
-    image = torch.fft.ifft2(torch.fft.fft2(pictures)[:, None] * H).real + noise
-    return image, torch.fft.ifft2(torch.fft.fft2(image) * G).real
-
-
-def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
+def best_gamma(H: Tensor, S: Tensor, noise: Tensor | float, at_design: Tensor) -> float:
     """The constant γ of the Wiener filter of the design depth (W, N, N) with the least error over all depths."""
 
     # The error of G = H*/(|H|² + γ), ⟨S|1 - G H_z|² + σ²|G|²⟩, needs but two means over the depths.
@@ -229,31 +158,31 @@ class Quality:
 
 @torch.no_grad()
 def quality(
-    elements: Sequence[Element],
-    config: WaveCameraConfig,
+    camera: Camera,
+    depths: Sequence[float],
     *,
+    design: float,
     train: Tensor,
     test: Tensor,
-    psf: ElementPsf | None = None,
+    kernels: Tensor | None = None,
 ) -> Quality:
-    """Image quality of test pictures (B, N, N), expected over noise, with filters for training pictures (A, N, N).
+    """Image quality of test pictures (B, N, N) at depths (D,) mm, expected over noise, with filters for training
+    pictures (A, N, N).
 
-    psf: `kernels` of the elements, if they are known.
+    design: mm, the depth whose kernel the Wiener filter inverts; kernels: (D, C, h, w) of the camera, if known.
     """
-    psf = kernels(elements, config) if psf is None else psf
-    H, S = transfer(psf, test.shape[-1]), spectrum(train)
-    if config.design in config.depths:
-        at_design = H[config.depths.index(config.design)]
-    else:
-        at_design = transfer(kernels(elements, config, depths=[config.design]), test.shape[-1])[0]
-    gamma = best_gamma(H, S, config.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, config.noise)}
-    powers = torch.stack([power(picture) for picture in test])
+    kernels = camera.kernels(depths) if kernels is None else kernels
+    size, S = test.shape[-1], power_spectrum(train, window="none")
+    H, noise = transfer_functions(camera.of_period(kernels, size), size), camera.sensor.noise_deviation(S)
+    at_design = H[depths.index(design)] if design in depths else transfer(camera, size, [design])[0]
+    gamma = best_gamma(H, S, noise, at_design)
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, noise)}
+    powers = power_spectrum(test[None], window="none")[:, None, None]
     by_depth, by_colour, of_pictures = {}, {}, {}
     for name, G in filters.items():
-        errors = errors_of_pictures(H, G, config.noise, powers)  # (B, D, W)
-        pooled = errors.mean(0)
-        of_pictures[name] = float(psnr(errors.mean(-1)).mean())
+        of_each = errors(H, powers, noise, filter=G)  # (B, D, C)
+        pooled = of_each.mean(0)
+        of_pictures[name] = float(psnr(of_each.mean(-1)).mean())
         by_depth[name] = tuple(psnr(pooled.mean(1)).tolist())
         by_colour[name] = tuple(psnr(pooled).mean(0).tolist())
     return Quality(
@@ -263,19 +192,29 @@ def quality(
         of_pictures,
         {name: max(values) - min(values) for name, values in by_depth.items()},
         gamma,
-        tuple(map(tuple, psf.energy.tolist())),
+        tuple(map(tuple, kernels.sum((-2, -1)).tolist())),
     )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ElementReport(Result):
-    """Elements of a camera, their kernels and image quality; initial: those before an optimisation, to compare with."""
+    """Elements of a camera, their kernels (D, C, h, w) and image quality; initial: those before an optimisation, to
+    compare with."""
 
     elements: Sequence[Element]
     config: WaveCameraConfig
-    kernels: ElementPsf
+    kernels: Tensor
     quality: Quality
     initial: "ElementReport | None" = dataclasses.field(default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, elements: Sequence[Element], config: WaveCameraConfig, *, train: Tensor, test: Tensor) -> Self:
+        """Kernels and `quality` of elements."""
+        camera = config.camera(elements)
+        with torch.no_grad():
+            kernels = camera.kernels(config.depths)
+        rating = quality(camera, config.depths, design=config.design, train=train, test=test, kernels=kernels)
+        return cls(elements, config, kernels, rating)
 
     @styled
     def draw(self) -> Figure:
@@ -313,15 +252,16 @@ class ElementReport(Result):
         psnrs.set(xlabel="object distance", ylabel="PSNR (dB)")
         psnrs.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1), borderaxespad=0)
         if self.initial is not None:
-            _draw_kernels(bottom[0], self.initial.kernels, "PSFs of the initial element")
-        _draw_kernels(bottom[-1], self.kernels)
+            _draw_kernels(bottom[0], self.initial, "PSFs of the initial element")
+        _draw_kernels(bottom[-1], self)
         return figure
 
 
-def _draw_kernels(figure: SubFigure, psf: ElementPsf, title: str = "PSFs") -> None:
-    kernels, (D, W) = array(psf.kernel.detach()), psf.kernel.shape[:2]
-    axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(psf.wavelengths.tolist())
-    half = 1e3 * float(psf.pitch) * kernels.shape[-1] / 2
+def _draw_kernels(figure: SubFigure, report: ElementReport, title: str = "PSFs") -> None:
+    kernels, config = array(report.kernels.detach()), report.config
+    D, W = kernels.shape[:2]
+    axes, colours = figure.subplots(W, D, squeeze=False), wavelength_colours(config.wavelengths)
+    half = 1e3 * config.pixel * kernels.shape[-1] / 2
     for w in range(W):
         brightest = kernels[:, w].max()
         for d in range(D):
@@ -329,8 +269,8 @@ def _draw_kernels(figure: SubFigure, psf: ElementPsf, title: str = "PSFs") -> No
             extent = (-half, half, -half, half)
             axes[w, d].imshow(logarithm, cmap="inferno", vmin=np.log10(_BLACK), vmax=0, extent=extent)
             axes[w, d].set(xticks=[], yticks=[])
-        axes[w, 0].set_ylabel(f"{1e3 * float(psf.wavelengths[w]):.0f} nm", color=colours[w], fontsize=9)
-    for panel, depth in zip(axes[0], psf.depths.tolist(), strict=True):
+        axes[w, 0].set_ylabel(f"{1e3 * config.wavelengths[w]:.0f} nm", color=colours[w], fontsize=9)
+    for panel, depth in zip(axes[0], config.depths, strict=True):
         panel.set_title(depth_text(depth, "∞"), fontsize=9)
     figure.supxlabel(
         f"{title}, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row",

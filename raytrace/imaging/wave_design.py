@@ -16,22 +16,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.closed_form import camera_error
+from raytrace.imaging.filters import DepthInvariantFilter, LinearFilter, TowardsMeasurement
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
-from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train, write_state
 from raytrace.imaging.variables import PhaseVariables
-from raytrace.imaging.wave_camera import ClosedForm, WaveCameraConfig, mirrored, restored, scene, transfer
+from raytrace.imaging.wave_camera import WaveCameraConfig, mirrored
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.numerics import detached
 from raytrace.optimization.least_squares import minimise_tensors
 from raytrace.settings import DesignSettings
-from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
-from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike
+from raytrace.wave_optics.element import Element, EvenPowers, Zernike
 from raytrace.wave_optics.fabrication import Process, as_rings, matched
 
 _NETWORK = RedNetShape(6, 16)  # behind the depth-invariant filter, the same for every colour
@@ -47,153 +48,177 @@ def _unwatched(start: int, evaluation: int, error: float) -> None:
     """No report."""
 
 
-class WaveCamera(nn.Module):
-    """A camera with a trainable phase element and filter.
+class RedNetOfChannels(RedNet):
+    """A RED-Net of one channel, for every channel of an image (B, C, n, n) alone."""
 
-    spectrum: S (n, n) of the pictures. v, t: square roots of the weight γ and of the depth in m of the filter "towards"
-    the measurement, both trained. network: (B, 1, n, n) -> the same, behind the depth-invariant filter.
-    """
+    def forward(self, image: Tensor) -> Tensor:
+        return super().forward(image.flatten(0, 1)[:, None])[:, 0].unflatten(0, image.shape[:2])
 
-    network: nn.Module | None
-    variables: PhaseVariables
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """The design of an element: settings, numbers of its camera, and S (n, n) of the training pictures."""
+
+    settings: DesignSettings
+    config: WaveCameraConfig
     spectrum: Tensor
 
-    def __init__(
+    def camera(self, variables: PhaseVariables) -> Camera[PhaseVariables]:
+        """The camera of the design; its sampling is that of the current element."""
+        settings, config = self.settings, self.config
+        filter: LinearFilter
+        if settings.restoration == "towards":
+            filter = TowardsMeasurement(self.spectrum, config.design)
+        else:
+            filter = DepthInvariantFilter(self.spectrum, config.depths)
+        network = RedNetOfChannels(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
+        planned = config.camera(variables, network, filter=filter)
+        planned.plan(config.depths)
+        return planned
+
+    def start(self, *, progress: Callable[[Iterable], Iterable] = iter, watch: Watch = _unwatched) -> PhaseVariables:
+        """The initial element: a lens for the design depth with random Zernike terms; the best smooth element of
+        several random starts; or the rings, of any height or in equal steps, nearest to that in phase."""
+        settings, config = self.settings, self.config
+        if settings.tolerance and settings.kind != "rings":
+            raise ValueError(f"a tolerance of {settings.tolerance:g} mm belongs to rings; {settings.kind!r} has none")
+        glass = find_glass(settings.glass)
+        goal = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
+        path = converging(goal) / (index(glass, goal.wavelength) - 1)
+        if settings.kind == "zernike":  # Noll's polynomials up to `terms`, in contact with a fixed lens
+            lens = Element(EvenPowers(path), goal.radius, glass)
+            random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
+            profile = Zernike(lens.radius.new_zeros(settings.terms))
+            variables = PhaseVariables(dataclasses.replace(lens, profile=profile), others=(lens,))
+            with torch.no_grad():
+                variables.change.copy_(settings.spread * random)
+                variables.change[:3] = 0  # piston and tilts change no picture
+            return variables
+        powers = path.new_zeros(max(settings.terms, len(path)))
+        powers[: len(path)] = path
+        smooth = Element(EvenPowers(powers), goal.radius, glass)
+        basis = radial_powers(smooth.radius, len(powers))[:, : settings.terms]
+        best = self.best_of_starts(lambda: PhaseVariables(smooth, basis=basis), progress=progress, watch=watch)
+        if settings.kind == "smooth":
+            return best
+        (element,) = detached(best())
+        element = as_rings(element, settings.pitch)
+        if settings.levels:
+            process = Process(levels=settings.levels, wavelength=float(goal.wavelength))
+            element, _ = matched(element, process, element.radius.new_tensor(config.wavelengths))
+        return PhaseVariables(element, tolerance=settings.tolerance)
+
+    def best_of_starts(
         self,
-        variables: PhaseVariables,
-        config: WaveCameraConfig,
-        spectrum: Tensor,
+        variables: Callable[[], PhaseVariables],
         *,
-        restoration: str = "blind",
-        network: nn.Module | None = None,
-    ):
-        super().__init__()
-        self.network = network
-        self.variables, self.config, self.restoration = variables, config, restoration
-        self.initial: tuple[Element, ...] = detached(variables())
-        self.register_buffer("spectrum", spectrum, persistent=False)
-        if restoration == "towards":
-            like = variables.change
-            self.v = nn.Parameter(like.new_tensor(0.1))
-            self.t = nn.Parameter(like.new_tensor(math.sqrt(1e-3 * config.design)))
-        # Rings in single precision: their sums take most of the time, and Adam needs no more.
-        dtype = torch.float32 if isinstance(variables.element.profile, Rings) else torch.float64
-        self.expected = ClosedForm(variables(), config, spectrum, dtype=dtype)
+        progress: Callable[[Iterable], Iterable] = iter,
+        watch: Watch = _unwatched,
+    ) -> PhaseVariables:
+        """The lowest minimum of the closed-form error by L-BFGS from random starts; several minima exist.
 
-    def transfer(self, *, draw: torch.Generator | None = None) -> Tensor:
-        """H (D, W, n, n), with random errors of fabrication if a generator is given."""
-        return self.expected.transfer(self.variables(draw=draw))
+        variables: new ones at each call; starts 0: unchanged variables; watch: called with the start, the evaluation,
+        both from 1, and its error.
+        """
+        settings = self.settings
+        best, least = variables(), math.inf
+        for number in progress(range(settings.starts)):
+            trial = variables()
+            with torch.no_grad():
+                for p in trial.parameters():
+                    random = draws(settings.seed, number, _START).standard_normal(p.shape)
+                    p.copy_(torch.as_tensor(settings.spread * random))
+            tried, evaluations = self.camera(trial), itertools.count(1)
 
-    def filter(self, H: Tensor) -> Tensor:
-        """G (W, n, n)."""
-        if self.restoration != "towards":
-            return depth_invariant_wiener(H, self.spectrum, self.config.noise)
-        at_depth = dataclasses.replace(scene(self.variables(), self.config), depths=1e3 * self.t.square().reshape(1))
-        kernels = psf(at_depth, plan=self.expected.plan)
-        return towards_measurement(transfer(kernels, self.spectrum.shape[-1])[0], self.v.square())
+            def error(tried: Camera = tried, number: int = number, evaluations: Iterator[int] = evaluations) -> Tensor:
+                square = camera_error(tried, self.spectrum, self.config.depths)
+                watch(number + 1, next(evaluations), float(square.detach()))
+                return square
 
-    def forward(self, pictures: Tensor, depth: Tensor, noise: Tensor, *, draw: torch.Generator | None = None) -> Tensor:
-        """Restored colours (B, W, n, n) of pictures (B, n, n) at depths of these numbers (B,); noise: added."""
-        H = self.transfer(draw=draw)
-        estimate = restored(H[depth], self.filter(H), pictures, noise)[1]
-        if self.network is None:
-            return estimate
-        like = next(self.network.parameters()).dtype
-        colours = self.network(estimate.flatten(0, 1)[:, None].to(like))[:, 0]
-        return colours.to(estimate).unflatten(0, estimate.shape[:2])
-
-
-# -- the initial element
-
-
-def start(
-    settings: DesignSettings,
-    config: WaveCameraConfig,
-    spectrum: Tensor,
-    *,
-    progress: Callable[[Iterable], Iterable] = iter,
-    watch: Watch = _unwatched,
-) -> PhaseVariables:
-    """The initial element: a lens for the design depth with random Zernike terms; the best smooth element of several
-    random starts; or the rings, of any height or in equal steps, nearest to that in phase."""
-    if settings.tolerance and settings.kind != "rings":
-        raise ValueError(f"a tolerance of {settings.tolerance:g} mm belongs to rings; {settings.kind!r} has none")
-    glass = find_glass(settings.glass)
-    goal = aim(radius=config.radius, sensor=config.sensor_distance, focus=config.design, exact=config.exact)
-    path = converging(goal) / (index(glass, goal.wavelength) - 1)
-    if settings.kind == "zernike":  # Noll's polynomials up to `terms`, in contact with a fixed lens
-        lens = Element(EvenPowers(path), goal.radius, glass)
-        random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
-        profile = Zernike(lens.radius.new_zeros(settings.terms))
-        variables = PhaseVariables(dataclasses.replace(lens, profile=profile), others=(lens,))
-        with torch.no_grad():
-            variables.change.copy_(settings.spread * random)
-            variables.change[:3] = 0  # piston and tilts change no picture
-        return variables
-    powers = path.new_zeros(max(settings.terms, len(path)))
-    powers[: len(path)] = path
-    smooth = Element(EvenPowers(powers), goal.radius, glass)
-    basis = radial_powers(smooth.radius, len(powers))[:, : settings.terms]
-    best = best_of_starts(
-        lambda: PhaseVariables(smooth, basis=basis),
-        config,
-        spectrum,
-        starts=settings.starts,
-        spread=settings.spread,
-        steps=settings.start_steps,
-        seed=settings.seed,
-        progress=progress,
-        watch=watch,
-    )
-    if settings.kind == "smooth":
+            lowest = min(minimise_tensors(list(trial.parameters()), error, steps=settings.start_steps).values)
+            if lowest < least:
+                best, least = trial, lowest
         return best
-    (element,) = detached(best())
-    element = as_rings(element, settings.pitch)
-    if settings.levels:
-        process = Process(levels=settings.levels, wavelength=float(goal.wavelength))
-        element, _ = matched(element, process, element.radius.new_tensor(config.wavelengths))
-    return PhaseVariables(element, tolerance=settings.tolerance)
 
+    def begin(
+        self,
+        folder: str | Path,
+        *,
+        pictures: str,
+        progress: Callable[[Iterable], Iterable] = iter,
+        watch: Watch = _unwatched,
+    ) -> tuple[Camera[PhaseVariables], Run]:
+        """The camera at the start of a run, and its folder, where the initial element is stored.
 
-def best_of_starts(
-    variables: Callable[[], PhaseVariables],
-    config: WaveCameraConfig,
-    spectrum: Tensor,
-    *,
-    starts: int,
-    spread: float,
-    steps: int,
-    seed: int = 0,
-    progress: Callable[[Iterable], Iterable] = iter,
-    watch: Watch = _unwatched,
-) -> PhaseVariables:
-    """The lowest minimum of the closed-form error by L-BFGS from random starts; several minima exist.
+        pictures: `digest` of the training pictures of the spectrum.
+        Raises training.OtherSettings if the folder was started with others.
+        """
+        inputs = {"world": dataclasses.asdict(self.config), "pictures": pictures}
+        run = Run(folder, dataclasses.asdict(self.settings) | inputs)
+        file = run.path / "start.pt"
+        if file.exists():
+            variables = dataclasses.replace(self, settings=dataclasses.replace(self.settings, starts=0)).start()
+            state = read_state(file)
+            try:
+                with torch.no_grad():
+                    variables.change.copy_(state["change"])
+                variables.start = state["start"]
+            except (KeyError, RuntimeError, TypeError) as error:
+                raise DamagedRun(f"{file}: not the start of this run; remove it to compute it again") from error
+        else:
+            variables = self.start(progress=progress, watch=watch)
+            state = {"start": variables.start, "change": variables.change.detach()}
+            write_state(file, state)
+        return self.camera(variables), run
 
-    variables: new ones at each call; spread: standard deviation of the initial changes; starts 0: unchanged variables;
-    watch: called with the start, the evaluation, both from 1, and its error.
-    """
-    best, least = variables(), math.inf
-    for number in progress(range(starts)):
-        trial = variables()
-        with torch.no_grad():
-            for p in trial.parameters():
-                p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
-        expected, evaluations = ClosedForm(trial(), config, spectrum), itertools.count(1)
+    @torch.no_grad()
+    def expected_error(self, camera: Camera[PhaseVariables]) -> float:
+        """`camera_error` of a camera at the depths of the design."""
+        return float(camera_error(camera, self.spectrum, self.config.depths))
 
-        def error(
-            trial: PhaseVariables = trial,
-            expected: ClosedForm = expected,
-            number: int = number,
-            evaluations: Iterator[int] = evaluations,
-        ) -> Tensor:
-            square = expected(trial())
-            watch(number + 1, next(evaluations), float(square.detach()))
-            return square
+    def learn(
+        self, camera: Camera[PhaseVariables], pictures: Pictures, run: Run, *, every: int = 20
+    ) -> Iterator[tuple[int, Record]]:
+        """The steps of optimisation, one at a time; an unfinished run is resumed."""
+        settings = self.settings
+        groups: list[dict[str, Any]] = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
+        for part, rate in ((camera.filter, 0.1 * settings.rate), (camera.network, _NETWORK_RATE)):
+            if parameters := [] if part is None else list(part.parameters()):
+                groups.append({"params": parameters, "lr": rate})
+        if settings.optimizer == "sgd":
+            optimizer = torch.optim.SGD(groups, momentum=0.5, nesterov=True)
+        else:
+            optimizer = {"adam": torch.optim.Adam, "adadelta": torch.optim.Adadelta}[settings.optimizer](groups)
 
-        lowest = min(minimise_tensors(list(trial.parameters()), error, steps=steps).values)
-        if lowest < least:
-            best, least = trial, lowest
-    return best
+        def loss(step: int, share: Share) -> tuple[Tensor, Record]:
+            record = {"rate": optimizer.param_groups[0]["lr"]}
+            if isinstance(camera.filter, TowardsMeasurement):
+                gamma, target = camera.filter.v.detach() ** 2, camera.filter.t.detach() ** 2
+                record |= {"gamma": float(gamma), "target_m": float(target)}
+            return self._loss(camera, pictures, step, share), record
+
+        return train(camera, optimizer, loss, steps=settings.steps, run=run, every=every, schedule=settings.schedule)
+
+    def _loss(self, camera: Camera[PhaseVariables], pictures: Pictures, step: int, share: Share) -> Tensor:
+        settings, config, n = self.settings, self.config, self.spectrum.shape[-1]
+        draw = torch.Generator().manual_seed(int(draws(settings.seed, step, _SAMPLE).integers(2**62)))
+        if settings.loss == "spectral":
+            # Every process computes all of it: it is not a sum over samples.
+            return camera_error(camera, self.spectrum, config.depths, draw=draw) / share.processes
+        epoch, batch = divmod(step, max(1, len(pictures) * _CROPS // settings.batch))
+        samples = []
+        for number in share.of(range(batch * settings.batch, (batch + 1) * settings.batch)):
+            sample = number % (len(pictures) * _CROPS)
+            patch = crop(pictures, sample, epoch=epoch, size=n // 2, crops=_CROPS, seed=settings.seed)
+            random = draws(settings.seed, epoch, number, _SAMPLE)
+            place = torch.tensor(int(random.integers(len(config.depths))))
+            normal = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
+            samples.append((mirrored(patch).to(self.spectrum), place, torch.as_tensor(normal).to(self.spectrum)))
+        picture, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
+        kernels = camera.kernels(config.depths, draw=draw)
+        image = camera.blurred(picture[:, None], kernels[depth]) + noise
+        estimate = camera.restore(image, kernels if isinstance(camera.filter, DepthInvariantFilter) else None)
+        return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch
 
 
 def radial_powers(radius: Tensor, terms: int) -> Tensor:
@@ -208,91 +233,3 @@ def radial_powers(radius: Tensor, terms: int) -> Tensor:
             coefficients[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
     power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
     return power[:, None] * coefficients.to(radius)
-
-
-def begin(
-    settings: DesignSettings,
-    config: WaveCameraConfig,
-    spectrum: Tensor,
-    folder: str | Path,
-    *,
-    pictures: str,
-    progress: Callable[[Iterable], Iterable] = iter,
-    watch: Watch = _unwatched,
-) -> tuple[WaveCamera, Run]:
-    """The camera at the start of a run, and its folder, where the initial element is stored.
-
-    pictures: `digest` of the training pictures of the spectrum.
-    Raises training.OtherSettings if the folder was started with others.
-    """
-    run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(config), "pictures": pictures})
-    file = run.path / "start.pt"
-    if file.exists():
-        variables = start(dataclasses.replace(settings, starts=0), config, spectrum)
-        state = read_state(file)
-        try:
-            with torch.no_grad():
-                variables.change.copy_(state["change"])
-            variables.start = state["start"]
-        except (KeyError, RuntimeError, TypeError) as error:
-            raise DamagedRun(f"{file}: not the start of this run; remove it to compute it again") from error
-    else:
-        variables = start(settings, config, spectrum, progress=progress, watch=watch)
-        state = {"start": variables.start, "change": variables.change.detach()}
-        write_state(file, state)
-    network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
-    return WaveCamera(variables, config, spectrum, restoration=settings.restoration, network=network), run
-
-
-# -- optimisation
-
-
-def learn_element(
-    camera: WaveCamera, pictures: Pictures, settings: DesignSettings, run: Run, *, every: int = 20
-) -> Iterator[tuple[int, Record]]:
-    """The steps of optimisation, one at a time; an unfinished run is resumed."""
-    groups: list[dict[str, Any]] = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
-    if camera.restoration == "towards":
-        groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})
-    if camera.network is not None:
-        groups.append({"params": list(camera.network.parameters()), "lr": _NETWORK_RATE})
-    if settings.optimizer == "sgd":
-        optimizer = torch.optim.SGD(groups, momentum=0.5, nesterov=True)
-    else:
-        optimizer = {"adam": torch.optim.Adam, "adadelta": torch.optim.Adadelta}[settings.optimizer](groups)
-    rates = [group["lr"] for group in groups]
-
-    def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * scheduled(settings.schedule, step / settings.steps)
-        record = {"rate": optimizer.param_groups[0]["lr"]}
-        if camera.restoration == "towards":
-            record |= {"gamma": float(camera.v.detach() ** 2), "target_m": float(camera.t.detach() ** 2)}
-        return _loss(camera, pictures, settings, step, share), record
-
-    return train(camera, optimizer, loss, steps=settings.steps, run=run, every=every)
-
-
-def scheduled(schedule: str, part: float) -> float:
-    """Factor of a learning rate at a part (0 to 1) of the steps: a function of the step alone, so that runs resume."""
-    return {"constant": 1.0, "linear": 1 - part, "cosine": 0.5 * (1 + math.cos(math.pi * part))}[schedule]
-
-
-def _loss(camera: WaveCamera, pictures: Pictures, settings: DesignSettings, step: int, share: Share) -> Tensor:
-    draw = torch.Generator().manual_seed(int(draws(settings.seed, step, _SAMPLE).integers(2**62)))
-    if settings.loss == "spectral":
-        # Every process computes all of it: it is not a sum over samples.
-        return camera.expected(camera.variables(draw=draw)) / share.processes
-    config, like, n = camera.config, camera.spectrum, camera.spectrum.shape[-1]
-    epoch, batch = divmod(step, max(1, len(pictures) * _CROPS // settings.batch))
-    samples = []
-    for number in share.of(range(batch * settings.batch, (batch + 1) * settings.batch)):
-        sample = number % (len(pictures) * _CROPS)
-        patch = crop(pictures, sample, epoch=epoch, size=n // 2, crops=_CROPS, seed=settings.seed)
-        random = draws(settings.seed, epoch, number, _SAMPLE)
-        place = torch.tensor(int(random.integers(len(config.depths))))
-        normal = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
-        samples.append((torch.as_tensor(mirrored(patch)).to(like), place, torch.as_tensor(normal).to(like)))
-    picture, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
-    estimate = camera(picture, depth, noise, draw=draw)
-    return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -33,6 +33,8 @@ from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan, plan
 from raytrace.wave_optics.scene import WaveScene, aperture, is_round
 from raytrace.words import did_you_mean, option
+
+T = TypeVar("T")
 
 _KEPT = 8  # sums that a memo keeps
 
@@ -179,8 +181,11 @@ def psf(
     """
     plan = planning.plan(scene, **sampling) if plan is None else plan
     engine, sums = planning.ENGINES[plan.engine], None
-    if engine.prepare is not None:
-        sums = engine.prepare(scene, plan, behind) if memo is None else _remembered(memo, scene, plan, engine.prepare)
+    if (prepare := engine.prepare) is not None:
+        if memo is None:
+            sums = prepare(scene, plan, behind)
+        else:
+            sums = remembered(memo, scene, plan, lambda: prepare(scene, plan, None))
     return ElementPsf(engine.kernels(scene, sums, plan), scene, plan)
 
 
@@ -198,10 +203,13 @@ def psf_by_depth(scene: WaveScene) -> ElementPsf:
     return ElementPsf(torch.cat([part.kernel for part in parts]), scene, parts[0].plan)
 
 
-def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan, None], Any]) -> Any:
-    """`make(scene, plan, None)` without graph, from memory where nothing but heights and coefficients has changed."""
+def remembered(memo: Memo, scene: WaveScene, key: Any, make: Callable[[], T], *constants: Tensor) -> T:
+    """`make()` without graph, from memory where nothing but heights and coefficients of the scene has changed.
+
+    key: of the result among others of the scene; constants: further numbers that it depends on.
+    """
     numbers, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
-    key: Any = structure
+    numbers, key = [*numbers, *constants], (key, structure)
     for element in scene.elements:
         free = element.numbers
         # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
@@ -213,9 +221,9 @@ def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveSc
         key = (key, *kind)
     if in_transform() or any(n.requires_grad for n in numbers):
         memo.made += 1
-        return make(scene, plan, None)
+        return make()
     with torch.no_grad():
-        return memo.find(numbers, (key, plan), lambda: make(scene, plan, None), most=_KEPT)
+        return memo.find(numbers, key, make, most=_KEPT)
 
 
 COLOURS = (0.46, 0.55, 0.64)

@@ -102,9 +102,10 @@ def stop_alone(
     sensor_distance: mm from the stop; object_distance: mm from it, inf allowed; wavelengths: (W,) µm.
     """
     radius = elements[0].radius
-    distances = (torch.as_tensor(t).to(radius) for t in (object_distance, sensor_distance, 0.0))
+    numbers = object_distance, sensor_distance, 0.0
+    distances = (torch.as_tensor(number, dtype=radius.dtype, device=radius.device) for number in numbers)
     before, behind, image = (Surface(t) for t in distances)
-    wavelengths = torch.as_tensor(wavelengths).to(radius)
+    wavelengths = torch.as_tensor(wavelengths, dtype=radius.dtype, device=radius.device)
     axis = wavelengths.new_zeros(1)
     return Lens(
         surfaces=(before, dataclasses.replace(behind, semi_diameter=float(radius.detach())), image),
