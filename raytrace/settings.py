@@ -41,12 +41,13 @@ class CodesignSettings(Settings):
     response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
     `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
     model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step:
-    unit of the variables, "sag" or "blur"; relearn: epochs of step 1 again with the nearest glasses of the catalogs, in
-    place of model glasses that vary; filters: of the closed form, "separate" or "joint", of colours; glass_thickness,
-    air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far, spread: range and
-    distribution of object distances; fields: points in y, one after the other for successive samples; pixel, size:
-    window of the PSF; network: "red-net" or "u-net"; depth, width: its layers, or poolings, and maps; rays, drt_rays,
-    sampling: fixed pupil points instead of `tol`.
+    unit of the variables, "sag" or "blur"; optimizer: of the lens, "adam", together with the network, or "lm", steps of
+    second order to the optimum of the closed form, behind which the network is trained; relearn: epochs of step 1 again
+    with the nearest glasses of the catalogs, in place of model glasses that vary; filters: of the closed form,
+    "separate" or "joint", of colours; glass_thickness, air_thickness, edge: limits; start: of the sensor, for an object
+    at focus_distance; near, far, spread: range and distribution of object distances; fields: points in y, one after
+    the other for successive samples; pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its
+    layers, or poolings, and maps; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
     as_built: training draws a perturbed lens for each sample; grade, limits: its tolerances, by default those of the
     file; refocus: "sensor", or "none"; cameras: perturbed ones of the test; center: of the PSF window, "" for the
     centroid of the light with tolerances and the chief ray without.
@@ -61,6 +62,7 @@ class CodesignSettings(Settings):
     edge: float | None = None
     hold: str = ""
     step: Literal["sag", "blur"] = "sag"
+    optimizer: Literal["adam", "lm"] = "adam"
     relearn: int = 0
     filters: str = "separate"
     start: str = "paraxial"

@@ -32,6 +32,7 @@ EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral -o learned.zmx
   raytrace codesign double_gauss --model gaussian --data pictures -o run --plot loss.png
   raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o from_closed_form
+  raytrace codesign cooke_triplet --optimizer lm --vary curvature sensor --hold efl --field 0 8 12 --data pictures -o lm
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
@@ -57,6 +58,11 @@ ROWS = {
         "unit of the variables, of which --rate-optics is a part in mm: sag at the edge (default), or blur, the RMS "
         "spread of the rays of all fields: the same for every number of any lens",
         choices=("sag", "blur"),
+    ),
+    "optimizer": option(
+        "of the lens: adam (default), together with the network, or lm: steps of second order to the optimum of the "
+        "closed form, from the best spots and from the file's lens, behind which the network is trained",
+        choices=("adam", "lm"),
     ),
     "relearn": option(
         "epochs of step 1 again, with the nearest catalog glasses in place of varied ones (index:1 abbe_number:1)",
@@ -182,7 +188,7 @@ _OF_ONE_RUN = ("model", "seed")
 #: Options that the help page shows; settings of a file, or of --set, are all of them.
 _SHOWN = (
     *("vary", "bounds", "hold", "start", "f_number", "wavelengths", "near", "far", "fields", "sensor", "as_built"),
-    *("grade", "epochs", "batch", "noise"),
+    *("grade", "optimizer", "epochs", "batch", "noise"),
 )
 
 

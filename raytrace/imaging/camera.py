@@ -17,6 +17,13 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer.step()
     camera.variables.project()                               # onto the bounds, if there are any
 
+Or the lens by steps of second order, under its bounds and conditions, and the network by an optimiser of torch:
+
+    def loss():
+        return (camera(pictures, distances, points=points, index=index) - camera.target(pictures)).abs().mean()
+
+    camera.lens_step(loss)
+
 Grey pictures, (B, H, W), of field points by their numbers, as in studies of a few points of a scene:
 
     grey = rt.Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1)
@@ -57,6 +64,7 @@ from raytrace.imaging.field_kernels import (
 )
 from raytrace.imaging.filters import LinearFilter
 from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions, with_haze
+from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
 from raytrace.imaging.restoration import restore
 from raytrace.imaging.sensor import Sensor
@@ -151,6 +159,7 @@ class Camera(nn.Module, Generic[V]):
             expected = "the Variables of a lens: Variables(lens, …), or of an element: PhaseVariables(element)"
             raise TypeError(f"Camera: `variables` is {kind}; expected {expected}")
         self.variables, self.element, self.network = variables, element, network
+        self._steps: LensSteps | None = None
         self.range, self.sensor, self.illumination = object_distances, sensor or Sensor(), illumination
         self.sensor_distance, self.wavelengths, self.exact = sensor_distance, wavelengths, exact
         self.boundary, self.filter = boundary, filter
@@ -250,6 +259,24 @@ class Camera(nn.Module, Generic[V]):
         if self.element is not None:
             groups.append({"params": [*self.element.parameters()], "lr": optics if element is None else element})
         return groups
+
+    def lens_step(self, loss: Callable[[], Tensor]) -> float:
+        """Take a step of second order of the variables of the lens that lowers a loss; its value before the step.
+
+        loss: a function without arguments, as
+        lambda: (camera(pictures, distances, index=index) - camera.target(pictures)).square().mean(). It is called at
+        trial lenses, too: give `index`, so that all have the same noise. The step is within the bounds and meets the
+        conditions of the variables, without `project`; an optimiser of the network takes its steps in between.
+        """
+        if not isinstance(self.variables, Variables):
+            raise ValueError("lens_step: the camera has a phase element without a lens; take a step of its heights")
+        if self._steps is None:
+            self._steps = LensSteps(self.variables)
+        return self._steps.step(loss)
+
+    def __getstate__(self) -> dict:
+        """The state without the last steps of the lens, of which only the next step would know."""
+        return {**vars(self), "_steps": None}
 
     # -- states that describe themselves -------------------------------------------------------------------------------
 

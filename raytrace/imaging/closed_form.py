@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import scipy.optimize
 import torch
@@ -26,12 +26,15 @@ from raytrace.imaging.restoration import (
 from raytrace.imaging.variables import PhaseVariables, Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
-from raytrace.optimization.least_squares import TensorDescent
+from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance
 from raytrace.tracing.spot import image_rays
 
+#: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
+#: lands beyond the next optimum, where a window holds only the middle of a blur.
+_FIRST_STEP = 0.02
 #: Sensor distances of a scan, by model; models of a single focus have one optimum, and Gaussians seldom two.
 _SCANNED = {"gaussian": 17, "drt": 81}  # 16 µm apart for the double Gauss at F/3
 _SETTLED = 1e-6  # relative decrease of the error below which a descent has ended
@@ -120,11 +123,18 @@ class Course:
 
 
 def optimise_closed_form(
-    camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None, steps: int | None = None
+    camera: Camera[Variables],
+    spectrum: Tensor,
+    *,
+    distances: Tensor | None = None,
+    steps: int | None = None,
+    optimizer: Literal["lbfgs", "lm"] = "lbfgs",
 ) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
-    By steps of second order (`lens_steps`). steps: at most so many, by default until it has settled.
+    optimizer: "lbfgs", L-BFGS-B of scipy in the units of the variables, or "lm", steps of second order in the metric of
+    the blur, under the conditions of the variables (`lens_steps`). steps: at most so many, by default until it has
+    settled.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, parts = camera.variables, []
@@ -134,15 +144,25 @@ def optimise_closed_form(
         parts.append((float(error.detach()), float(penalty.detach())))
         return error + penalty
 
-    steps_of_lens = LensSteps(variables)
+    bounds = []
+    for variable in variables.variables:
+        ends = variables.bounds.get(variable.name, (-math.inf, math.inf))
+        low, high = sorted((end - variable.start) / variable.unit for end in ends)
+        bounds.append((low, high))
 
     def descend() -> TensorDescent:
-        return steps_of_lens.minimise(loss, **({} if steps is None else {"cycles": steps}))
+        # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
+        if optimizer == "lm":
+            return LensSteps(variables).minimise(loss, **({} if steps is None else {"cycles": steps}))
+        most = {} if steps is None else {"steps": steps}
+        parameters = list(variables.parameters())
+        return minimise_tensors(parameters, loss, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11, **most)
 
     descent = descend()
     # A penalty on a solved thickness has a kink where it begins, at which a descent stops too soon: restart it.
     while (
         steps is None
+        and optimizer == "lbfgs"
         and variables.held is not None
         and descent.values[0] - descent.values[-1] > _SETTLED * descent.values[-1]
     ):
@@ -161,6 +181,24 @@ def optimise_closed_form(
         no_optimum = out_of_focus(camera)
     errors, penalties = zip(*parts, strict=True)
     return Course(errors, penalties, names, no_optimum)
+
+
+def closed_form_from_spots(camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None) -> Course:
+    """Minimise `camera_error` by steps of second order from the lens of the sharpest spots, and from the lens as it is.
+
+    Returns the better one, at which the lens of the camera is.
+    """
+    variables, ends = camera.variables, []
+    start = copy.deepcopy(variables.state_dict())
+    for spots_first in (True, False):
+        variables.load_state_dict(start)
+        if spots_first:
+            LensSteps(variables).minimise_spots()
+        course = optimise_closed_form(camera, spectrum, distances=distances, optimizer="lm")
+        ends.append((course, copy.deepcopy(variables.state_dict())))
+    best, state = min(ends, key=lambda end: end[0].errors[-1] + end[0].penalties[-1])
+    variables.load_state_dict(state)
+    return best
 
 
 def least_of_closed_form(

@@ -25,6 +25,7 @@ from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import (
     Course,
     camera_error,
+    closed_form_from_spots,
     even_distances,
     field_filters,
     focus_columns,
@@ -514,10 +515,13 @@ def run_model(
         return
     trained = camera(lens, settings).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
-    if settings.start in ("spectral", GAUSSIAN) and not joint.checkpoint.exists():
+    is_second_order = settings.optimizer == "lm"
+    if (is_second_order or settings.start in ("spectral", GAUSSIAN)) and not joint.checkpoint.exists():
         course = to_closed_form(trained, settings, spectrum_of(train_pictures, settings))
         if course.no_optimum:
             warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
+    if is_second_order:  # the network is trained behind this lens
+        trained.variables.requires_grad_(False)
     for step, record in optimise(trained, train_pictures, settings, joint):
         yield STEPS[0], step, record
     if settings.relearn:
@@ -625,10 +629,15 @@ OPTIMUM_COLUMNS = tuple(field.name for field in dataclasses.fields(Optimum))[:9]
 
 
 def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spectrum: Tensor) -> Course:
-    """Move the lens of a camera to the closed-form optimum that `start` specifies: of its model, or of Gaussian DRT."""
+    """Move the lens of a camera to an optimum of the closed form: by steps of second order for the optimizer "lm", else
+    to the one that `start` specifies: of its model, or of Gaussian DRT."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
     first = camera(trained.variables.lens, dataclasses.replace(settings, model=model))
-    course, _ = least_of_closed_form(first, spectrum, distances=even_distances(first, spread=settings.spread))
+    distances = even_distances(first, spread=settings.spread)
+    if settings.optimizer == "lm":
+        course = closed_form_from_spots(first, spectrum, distances=distances)
+    else:
+        course, _ = least_of_closed_form(first, spectrum, distances=distances)
     trained.variables.load_state_dict(first.variables.state_dict())
     return course
 
@@ -639,7 +648,10 @@ def closed_form(lens: Lens, settings: CodesignSettings, spectrum: Tensor) -> Opt
     if settings.start == GAUSSIAN:
         to_closed_form(optimised, settings, spectrum)
     distances = even_distances(optimised, spread=settings.spread)
-    course, downhill = least_of_closed_form(optimised, spectrum, distances=distances)
+    if settings.optimizer == "lm":
+        course, downhill = closed_form_from_spots(optimised, spectrum, distances=distances), math.nan
+    else:
+        course, downhill = least_of_closed_form(optimised, spectrum, distances=distances)
     with torch.no_grad():
         lens = optimised.variables()
         error = camera_error(optimised, spectrum, distances)

@@ -1,7 +1,7 @@
 """Steps of second order of the variables of a lens, for any loss of a camera.
 
-The loss is lifted into the rays of the lens (`optimization.lifted`): a step is one of damped least squares in the metric
-of the RMS blur, within the bounds and under the conditions of the variables, which it meets exactly.
+The loss is lifted into the rays of the lens (`optimization.lifted`): a step is one of damped least squares in the
+metric of the RMS blur, within the bounds and under the conditions of the variables, which it meets exactly.
 """
 
 import dataclasses
@@ -44,24 +44,32 @@ class LensSteps:
         a call tell its curvature.
         """
         self._begin(loss)
+        lower, upper = self._ends()
         descent = least_squares(
-            self.lifted.state, self._numbers(), **self._ends(), typical=self.typical, cycles=1,
+            self.lifted.state, self._numbers(), lower=lower, upper=upper, typical=self.typical, cycles=1,
             options=dataclasses.replace(OPTIONS, damping=self.damping),
         )  # fmt: skip
         self.damping = descent.cycles[-1].damping if descent.cycles else OPTIONS.damping
         self._put(descent.state.x)
         return self._values[0]
 
+    def minimise_spots(self, *, cycles: int = 100) -> None:
+        """Move to the smallest spots of the lens's own fields, wavelengths and object distance."""
+        lower, upper = self._ends()
+        descent = least_squares(
+            self._rows, self._numbers(), lower=lower, upper=upper, typical=self.typical, cycles=cycles
+        )
+        self._put(descent.state.x)
+
     def minimise(self, loss: Callable[[], Tensor], *, cycles: int = 300) -> TensorDescent:
         """Descend to the minimum of a loss, a function without arguments of the current lens."""
         self._begin(loss)
-        start = self._numbers()
+        start, (lower, upper) = self._numbers(), self._ends()
         is_flat = not self._function(start)[1].any()
-        ends = self._ends()
-        descent = descend(self.lifted, start, **ends, cycles=0 if is_flat else cycles)
+        descent = descend(self.lifted, start, lower=lower, upper=upper, cycles=0 if is_flat else cycles)
         x, gradient = descent.state.x, self._function(descent.state.x)[1]
         self._put(x)
-        reached = np.where(gradient > 0, ends["lower"], ends["upper"])
+        reached = np.where(gradient > 0, lower, upper)
         at_end = (gradient != 0) & np.isclose(x, reached, rtol=1e-9, atol=1e-9)
         return TensorDescent((*self._values, descent.state.cost), tuple(at_end.tolist()), is_flat)
 
@@ -79,12 +87,12 @@ class LensSteps:
         for variable, parameter, number in zip(self.variables.variables, self.parameters, x, strict=True):
             parameter.fill_((number - variable.start) / variable.unit)
 
-    def _ends(self) -> dict[str, np.ndarray]:
-        """Bounds of the numbers."""
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the numbers."""
         x, free = self._numbers(), np.array([parameter.requires_grad for parameter in self.parameters])
         names = [variable.name for variable in self.variables.variables]
         lower, upper = np.array([self.variables.bounds.get(name, (-math.inf, math.inf)) for name in names]).T
-        return {"lower": np.where(free, lower, x), "upper": np.where(free, upper, x)}
+        return np.where(free, lower, x), np.where(free, upper, x)
 
     def _function(self, x: np.ndarray) -> Slope:
         """The loss and its gradient by the numbers."""
