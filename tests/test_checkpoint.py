@@ -248,7 +248,7 @@ def test_no_step_begins_that_would_not_end_in_time(seconds, monkeypatch):
     assert found.cycles == len(found.history)
     clock.now = 100.0
     descend(Lifted(clock, clock.state, np.ones(2)), np.array([-1.2, 1.0]), cycles=1000, until=100.0 + seconds, **FREE)
-    assert clock.now - 100.0 <= max(seconds, 40.0)
+    assert clock.now - 100.0 <= max(seconds, 30.0 + 21.0)  # the first evaluations with derivatives and without
 
 
 def test_cycles_on_a_narrower_beam_are_counted():

@@ -251,7 +251,7 @@ def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet)
     assert found.plot().axes
     assert found.document()["operands"] == []
     held = rt.optimize(triplet, merit=merit, vary="curvature:1-3 sensor", hold="efl=100", cycles=3).lens
-    assert float(rt.first_order(held).effective_focal_length) == pytest.approx(100, abs=1e-6)
+    assert float(rt.first_order(held).effective_focal_length) == pytest.approx(100, abs=1e-4)
 
 
 def test_bounds_stay_with_the_lens(triplet, tmp_path):

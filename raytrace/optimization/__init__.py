@@ -8,11 +8,13 @@ merit_of_batch    merit functions of a batch of lenses, with derivatives
 jacobian          derivatives of rays, merit functions and any function of a lens by its variables
 evaluate          the value of a merit function row by row, with its table and figure
 problem           constraint syntax; merit function and constraints as the sum of squares of the solver
-least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B
+least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B of tensors
 optimize          `optimize`: opening and descent
 opening           rays brought through a lens at which most of them fail
 attained          targets and attained values of conditions and boundaries
 contradictions    conditions that exclude one another
+loss              losses: spots first, descents, restarts, check by denser rays; `lifted`: a loss as a sum of squares;
+                  `quantities`: landing points, transfer functions and PSFs, of which losses are functions
 optimized         `Optimized`, the result of `optimize`; `optimized_figure`: its figure
 checkpoint        state of a descent, from which it resumes
 glass_choice      variable glasses of catalogs

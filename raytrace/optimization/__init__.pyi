@@ -7,5 +7,8 @@ from raytrace.optimization.operands.operand import Measure as Measure
 from raytrace.optimization.optimize import optimize as optimize
 from raytrace.optimization.optimized import Optimized as Optimized
 from raytrace.optimization.problem import Condition as Condition
+from raytrace.optimization.quantities import Kernels as Kernels
+from raytrace.optimization.quantities import Otf as Otf
+from raytrace.optimization.quantities import Points as Points
 from raytrace.optimization.search import Searched as Searched
 from raytrace.optimization.search import search as search

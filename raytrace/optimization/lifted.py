@@ -36,6 +36,7 @@ from raytrace.optimization.least_squares import (
     SumOfSquares,
     least_squares,
 )
+from raytrace.psf_models import EmptyPsf
 
 _PAIRS = 30  # of a step and a change of the gradient, that are kept
 _FIRST = 0.2  # of the RMS spot: blur of the first undamped step
@@ -96,7 +97,10 @@ class Lifted:
 
     def state(self, x: np.ndarray, derivatives: bool) -> LiftedLoss:
         rows = self.rows(x, derivatives)
-        loss, gradient = self.function(x)
+        try:
+            loss, gradient = self.function(x)
+        except EmptyPsf:  # of a trial lens, which is then refused
+            loss, gradient = np.inf, np.zeros(len(x))
         limits = np.concatenate([rows.limits, rows.sides.excess])
         state = LiftedLoss(x, np.zeros(0), rows.lost, Sides.none(len(x)), rows.held, limits, loss=loss)
         if not derivatives:
@@ -190,7 +194,7 @@ def descend(
     cycles, until: as for `least_squares`; watch: invoked after each cycle.
     """
     history: tuple[Cycle, ...] = ()
-    evaluations, started = 0, time.monotonic()
+    evaluations, started, before = 0, time.monotonic(), np.inf
     while True:
         lifted.forget()
         offset = len(history), evaluations, time.monotonic() - started
@@ -206,13 +210,13 @@ def descend(
             if watch is not None:
                 watch(counted(cycle), start)
 
-        before = lifted.function(x)[0]
         descent = least_squares(
             lifted.state, x, lower=lower, upper=upper, typical=lifted.typical, options=OPTIONS,
             cycles=cycles - len(history), until=until, watch=each,
         )  # fmt: skip
         history, evaluations = (*history, *map(counted, descent.cycles)), evaluations + descent.evaluations
-        x = descent.state.x
+        x, end = descent.state.x, descent.state.cost
         ended = descent.stopped in ("cycles", "seconds", "interrupted")
-        if ended or before - descent.state.cost <= _AGAIN * abs(before):
+        if ended or before - end <= _AGAIN * abs(end):
             return dataclasses.replace(descent, cycles=history, evaluations=evaluations)
+        before = end

@@ -139,7 +139,9 @@ def optimize(
     if callable(merit):
         if loss is not None:
             raise NoProblem(f"{option('loss')} and a function as {option('merit')}: give one of them")
-        loss, of, first, restarts, merit = merit, "lens", None, 0, None
+        loss, first, restarts, quantity, merit = merit, None, 0, None, None
+    else:
+        quantity = quantity_of(of)
     if loss is not None and (glasses or as_built is not None):
         given = option("vary", "glass") if glasses else option("as_built")
         raise NoProblem(f"{given} goes with a merit of rows, not with a function: leave it out")
@@ -152,7 +154,7 @@ def optimize(
         dependencies |= {} if term is None else {"as built": digest(term.about())}
     if is_stored and loss is not None:
         name = getattr(loss, "__qualname__", type(loss).__name__)
-        dependencies |= {"loss": name, "of": repr(of), "object distances": plain(object_distances)}
+        dependencies |= {"loss": name, "of": repr(quantity), "object distances": plain(object_distances)}
         dependencies |= {"restarts": restarts, "first": first is not None}
     resumed = stored(dependencies)
     if set(resumed.glasses) - set(glasses):
@@ -169,7 +171,7 @@ def optimize(
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
     if loss is not None:
-        measured = Loss.of(loss, quantity_of(of), object_distances)
+        measured = Loss.of(loss, quantity, object_distances)
         descents = LossDescents(
             problem, measured, lower=lower, upper=upper, typical=typical, evaluated=resumed.evaluated
         )  # fmt: skip

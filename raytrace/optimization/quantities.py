@@ -54,9 +54,8 @@ class Points:
     def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
         pupil, _ = equal_rings(self.rings)
         fields = field_points(None, like=lens)
-        traced = [
-            image_rays(without_apertures(at), pupil, fields=fields) for at in _at_distances(lens, object_distances)
-        ]
+        lenses = map(without_apertures, _at_distances(lens, object_distances))
+        traced = [image_rays(moved, pupil, fields=fields) for moved in lenses]
         return torch.stack([torch.where(rays.valid, rays.position[:2], torch.nan) for rays in traced], 1)
 
     def denser(self) -> "Points":
@@ -111,15 +110,15 @@ class Kernels:
 QUANTITIES = {"points": Points, "otf": Otf, "kernels": Kernels}
 
 
-def quantity_of(of: "str | Quantity") -> Quantity | None:
+def quantity_of(word: "str | Quantity") -> Quantity | None:
     """The quantity of a name, None of "lens". Raises ValueError."""
-    if not isinstance(of, str):
-        if isinstance(of, Quantity):
-            return of
-        raise TypeError(f"{option('of')} is {named_value(of)}; expected a name, or a quantity as Points(rings=12)")
-    if of == "lens":
+    if not isinstance(word, str):
+        if isinstance(word, Quantity):
+            return word
+        raise TypeError(f"{option('of')} is {named_value(word)}; expected a name, or a quantity as Points(rings=12)")
+    if word == "lens":
         return None
-    if of not in QUANTITIES:
+    if word not in QUANTITIES:
         known = ("lens", *QUANTITIES)
-        raise ValueError(f"{option('of')} {of!r}: expected {', '.join(known)}{did_you_mean(of, known)}")
-    return QUANTITIES[of]()
+        raise ValueError(f"{option('of')} {word!r}: expected {', '.join(known)}{did_you_mean(word, known)}")
+    return QUANTITIES[word]()
