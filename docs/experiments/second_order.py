@@ -5,8 +5,8 @@ best spots.
     python docs/experiments/second_order.py --table    # prints the table of docs/loss.md and draws its figure
 
 Every run starts at a lens whose free numbers are displaced at random. The error is the mean square error of a pixel
-behind the best linear filter of all object distances (`imaging.closed_form.camera_error`), of Gaussian PSFs while the lens
-is optimised, and of PSFs of all rays (DRT) at the end. Adam has its best rate of three, by seed 0, and a budget of
+behind the best linear filter of all object distances (`imaging.closed_form.camera_error`), of Gaussian PSFs while the
+lens is optimised, and of PSFs of all rays (DRT) at the end. Adam has its best rate of three, by seed 0, and a budget of
 processor time; the others end by themselves. Time is processor time of one thread.
 """
 
