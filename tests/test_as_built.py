@@ -132,6 +132,7 @@ def test_without_the_compiled_trace(cooke):
         assert np.allclose(one, other, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_aimed_rays(cooke):
     lens = cooke.at(ray_aiming="real")
     start, state = states(lens, "curvature:3")

@@ -234,6 +234,7 @@ def test_a_run_of_both_steps_and_its_outcome(tmp_path):
     assert list(run_model(*arguments, about={"lens": "double_gauss"}, distances=(1e4, 3e4))) == []
 
 
+@pytest.mark.slow
 def test_a_run_stopped_in_either_step_ends_as_if_it_had_not_been(tmp_path):
     train_pictures, test_pictures = split(dead_leaves(10, size=32))
 
@@ -314,6 +315,7 @@ def test_a_resumed_run_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
     assert planned[1] == planned[3] != ("drt", planned[0][1])
 
 
+@pytest.mark.slow
 def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     """From the paraxial start both go towards the lens: to the bound, and no further."""
     settings = dataclasses.replace(SMALL, bounds="sensor:57.88,58", epochs=2)
@@ -440,6 +442,7 @@ def test_rho_is_of_the_paraxial_model_alone():
             assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
 
 
+@pytest.mark.slow
 def test_training_moves_the_sensor_towards_less_loss(tmp_path):
     """From a sensor 0.3 mm too close, Adam moves away from the lens at 1 µm a step."""
     settings = dataclasses.replace(SMALL, start="57.3", epochs=5)
@@ -448,6 +451,7 @@ def test_training_moves_the_sensor_towards_less_loss(tmp_path):
     assert steps[-1][1]["sensor"] > 57.3 + 5 * MICROMETRE
 
 
+@pytest.mark.slow
 def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
     """Optima over 10 to 50 m with a 1/f² spectrum: both near 34 m paraxial, Gaussian DRT closer to the lens."""
     S = patch_spectrum(dead_leaves(8, size=64), 48)

@@ -233,6 +233,7 @@ def test_a_kernel_is_the_same_in_any_batch_with_and_without_derivatives(triplet)
         torch.testing.assert_close(alone[0].detach(), kernels[k], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_first_example_runs():
     block = inspect.getdoc(raytrace.imaging.camera).split("\n\n")[2]
     names = {"rt": rt, "torch": torch}
@@ -414,6 +415,7 @@ def test_joint_filters_leave_less_error_of_correlated_colours(triplet, pictures)
         spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="both"))
 
 
+@pytest.mark.slow
 def test_glasses_that_vary_snap_to_the_catalog_and_the_rest_is_learned_again(triplet, pictures):
     """The camera of step 1 with catalog glasses: its other variables go on, its network goes with it."""
     settings = dataclasses.replace(

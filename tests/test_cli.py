@@ -897,6 +897,7 @@ def test_focus_at_25_m_ray_by_ray(run):
         assert document[expected] == pytest.approx(1e3 * rms, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_focus_with_weights_equals_brute_force(run):
     """Σ weights · rms² of `raytrace spot` is a parabola in the sensor distance; its vertex is the focus."""
     distances, fields, wavelengths = (10000, 25000, "inf"), (0, 10), (0.486, 0.656)

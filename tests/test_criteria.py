@@ -70,6 +70,7 @@ def test_mtf_has_exact_derivatives(triplet):
     check_gradient(triplet, "mtf@30")
 
 
+@pytest.mark.slow
 def test_changes_of_the_mtf_are_those_of_single_lenses(triplet):
     rows = rt.tolerances(triplet, "radius:3=0.1%", compensators=[])
     found = rt.tolerance(triplet, rows, criterion="mtf@30", trials=0, fields=[0, 5])

@@ -151,19 +151,20 @@ def gradient_scores(case, scene, result) -> dict[tuple, float]:
     as d x/d k = 1e-34 of an almost flat surface.
     """
     unit_rounding, leaves, scores = ROUNDING[torch.float64], scene.parameters, {}
+    least, sizes = smallest(case, torch.float64), {name: leaf.abs().tolist() for name, leaf in leaves.items()}
     for output in OUTPUTS:
         if not any(output in expected.get("grad", ()) for expected in case["expected"]):
             continue
         found = torch.autograd.grad(result[output].sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
-        gradients = dict(zip(leaves, found, strict=True))
+        gradients = {name: None if g is None else g.tolist() for name, g in zip(leaves, found, strict=True)}
         for i, expected in enumerate(case["expected"]):
             for name, value in expected.get("grad", {}).get(output, {}).items():
                 if value is None:
                     continue
-                gradient = 0.0 if gradients[name] is None else gradients[name][i].item()
-                size = max(1.0, leaves[name][i].abs().item())
+                gradient = 0.0 if gradients[name] is None else gradients[name][i]
+                size = max(1.0, sizes[name][i])
                 scale = expected["grad_cond"][output][name] + abs(float(value)) + expected["cond"][output] / size
-                scale = max(unit_rounding * scale, smallest(case, torch.float64))
+                scale = max(unit_rounding * scale, least)
                 scores[i, output, name] = error(gradient, value) / scale
     return scores
 

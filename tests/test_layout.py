@@ -97,6 +97,7 @@ def test_views_and_colours_by_wavelength(tmp_path):
     assert "0.45 µm" in "".join(text.get_text() for text in figure.legends[0].get_texts())
 
 
+@pytest.mark.slow
 def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
     lens = rt.read_lens("cooke_triplet")
     for aperture in (

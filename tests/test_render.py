@@ -479,6 +479,7 @@ def test_the_grid_is_refined_to_the_tolerance(triplet):
     assert errors[1] <= 0.01
 
 
+@pytest.mark.slow
 def test_the_error_of_a_few_cells_is_about_that_of_all(triplet, monkeypatch):
     how = {"model": "gaussian", "illumination": False, "distortion": False, "tol": 0.05}
     few = optics(triplet, FIELD, **how)
@@ -488,6 +489,7 @@ def test_the_error_of_a_few_cells_is_about_that_of_all(triplet, monkeypatch):
     assert few.error == pytest.approx(every.error, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_kernels_are_computed_once_unless_they_are_differentiated(triplet, monkeypatch):
     places = []
@@ -500,6 +502,7 @@ def test_kernels_are_computed_once_unless_they_are_differentiated(triplet, monke
     assert optics(triplet, FIELD, object_distances=distance, **how).kernels.requires_grad
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_wavelengths_over_the_response_are_no_more_than_the_tolerance_needs(triplet):
     counts = [
@@ -648,6 +651,7 @@ def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
         optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
 
 
+@pytest.mark.slow
 def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
     """2 × 2 pixels of the scene in one of the sensor: the mean of the image on the finer pixels."""
     fine = dataclasses.replace(FIELD, pixels=(2 * COLUMNS, 2 * ROWS))

@@ -437,6 +437,7 @@ def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_pat
     assert said in command_line("search", "plate.csv", *words).error
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_plane_plates_have_no_focal_length_and_no_warning():
     """Of a plate f = ∞ without a derivative, in a row and in a search, where the power that f has is held."""
