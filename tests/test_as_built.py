@@ -163,6 +163,7 @@ def test_optimize_lowers_the_expectation(cooke):
     assert usual.as_built is None
 
 
+@pytest.mark.slow
 def test_weight_is_relative_to_all_rows_but_boundaries(cooke):
     """Of a merit function of spots M² is the mean square spot of the nominal lens, and E[q] counts alike."""
     lens = rt.focus(cooke, fields=[0, 8.4, 11.9]).lens

@@ -103,6 +103,7 @@ def test_the_sensor_follows_the_best_focus(lens):
     assert torch.allclose(vertex["built"], vertex["nominal"].expand(2), atol=2e-5)  # mm
 
 
+@pytest.mark.slow
 def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
     built = camera(lens, BUILT)
     errors = rt.tolerancing.draw_errors(built.tolerances, 4)

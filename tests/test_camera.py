@@ -205,6 +205,7 @@ def test_losses_of_shares_add_up_to_that_of_the_batch():
     assert float(sum(apart)) == pytest.approx(float(together), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_fields_take_turns():
     settings = dataclasses.replace(SMALL, fields=(0.0, 14.0), model="gaussian")
     own = camera(read_lens(LENS), settings)
@@ -427,19 +428,21 @@ def test_a_run_writes_the_lens_that_it_learned(tmp_path):
     assert 1e-3 * distance_in_focus(learned, best_focus) == pytest.approx(found.focus_rms_m, rel=1e-9)
 
 
-def test_rho_is_of_the_paraxial_model_alone():
+@pytest.mark.parametrize(
+    "model", ["paraxial", "fourier", *(pytest.param(model, marks=pytest.mark.slow) for model in ("gaussian", "drt"))]
+)
+def test_rho_is_of_the_paraxial_model_alone(model):
     """σ = ρε: the second moment of a kernel grows with ρ², less that of the pixel; other models do not know it."""
     distances = number([20e3])
-    for model in ("paraxial", "fourier", "gaussian", "drt"):
-        narrow, wide = (
-            camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
-            for rho in (0.3, 0.6)
-        )
-        assert torch.equal(narrow, wide) == (model != "paraxial")
-        if model == "paraxial":
-            x = torch.arange(-10, 11, dtype=torch.float64)
-            blurs = [float((kernel[0, 0].sum(0) * x**2).sum().detach()) - 1 / 12 for kernel in (narrow, wide)]
-            assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
+    narrow, wide = (
+        camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
+        for rho in (0.3, 0.6)
+    )
+    assert torch.equal(narrow, wide) == (model != "paraxial")
+    if model == "paraxial":
+        x = torch.arange(-10, 11, dtype=torch.float64)
+        blurs = [float((kernel[0, 0].sum(0) * x**2).sum().detach()) - 1 / 12 for kernel in (narrow, wide)]
+        assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
 
 
 @pytest.mark.slow

@@ -165,6 +165,7 @@ def test_a_mosaic_is_that_of_the_place(triplet):
     assert not torch.equal(recorded[0], sensor.demosaic(sensor.sample(image[0])[None], (1, 0))[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["gaussian", pytest.param("drt", marks=pytest.mark.slow)])
 def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     """Curvatures, spaces and sensor through PSFs, noise and a network, float64."""

@@ -149,6 +149,7 @@ def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):
     assert float((own.kernels(z) - tilted.kernels(z)).abs().max().detach()) < 1e-6
 
 
+@pytest.mark.slow
 def test_semi_diameters_vignette_where_asked(lens):
     """Light beyond the rims of surfaces 5 and 7 is lost; the stop is as wide as the F/number says."""
     settings = dataclasses.replace(SMALL, f_number=1.9, model="drt", normalise="energy", size=61)

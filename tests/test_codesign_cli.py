@@ -315,6 +315,7 @@ def test_progress_counts_the_batches_of_a_test(finished):
     assert any(text.startswith("refine, loss 0.") for text in shown)
 
 
+@pytest.mark.slow
 def test_the_closed_form_prints_its_course_and_draws_it_as_training_does(run, pictures, finished):
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
     code, out, err = run(*command, "-o", "closed", "--batch", "4", "--plot", "loss.png")

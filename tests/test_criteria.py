@@ -66,6 +66,7 @@ def test_mtf_is_that_of_single_lenses(triplet, frequency):
         )
 
 
+@pytest.mark.slow
 def test_mtf_has_exact_derivatives(triplet):
     check_gradient(triplet, "mtf@30")
 
@@ -203,6 +204,7 @@ def test_change_of_the_psf_is_that_of_single_lenses(triplet, model):
         assert float(values[k]) == pytest.approx(float(change), rel=1e-9 if model == "gaussian" else 5e-3)
 
 
+@pytest.mark.slow
 def test_change_of_the_psf_has_exact_derivatives(triplet):
     check_gradient(triplet, "psf", pixel=0.004, size=33)
 

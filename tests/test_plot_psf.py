@@ -48,6 +48,7 @@ def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
     assert energy == pytest.approx(float(result.energy[0, 0]), abs=0.05)
 
 
+@pytest.mark.slow
 def test_ray_traced_light_fills_its_disc_evenly():
     """Far out of focus a uniform disc of 2 σ: no pattern of rays, no window that cuts it."""
     result, light, _ = seen("singlet", "drt", fields=number([[0.0], [0.0]]), object_distances=number([2000.0]))

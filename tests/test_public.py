@@ -255,6 +255,7 @@ def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
         rt.spot(lens, fields=[80])
 
 
+@pytest.mark.slow
 def test_a_lens_is_focused_by_every_criterion(tmp_path):
     lens = rt.read_lens("double_gauss").at(object_distance=25e3)
     found = rt.focus(lens)
@@ -464,6 +465,7 @@ def test_the_version_is_that_of_the_package():
 # -- waves -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_element_at_the_stop_of_a_lens_and_an_element_as_a_lens():
     """Without height the kernels are those of the lens; a smooth lens for 1 m brings 1 m to its sensor, as rays see."""
     lens = rt.read_lens("double_gauss")

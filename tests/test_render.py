@@ -443,6 +443,7 @@ def test_render_chooses_sensor_grid_and_window(triplet):
     torch.testing.assert_close(encoded(linearised(picture)) * 255, picture.float(), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_grey_picture_and_one_smaller_than_a_kernel(triplet):
     fine = rt.Sensor(size=(0.09, 0.07), pixels=(9, 7))
     image = rt.render(triplet, random(7, 9), sensor=fine, model="gaussian", tol=0.1).image
