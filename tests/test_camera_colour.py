@@ -416,7 +416,6 @@ def test_joint_filters_leave_less_error_of_correlated_colours(triplet, pictures)
         spectrum_of(pictures[0], dataclasses.replace(SETTINGS, filters="both"))
 
 
-@pytest.mark.slow
 def test_glasses_that_vary_snap_to_the_catalog_and_the_rest_is_learned_again(triplet, pictures):
     """The camera of step 1 with catalog glasses: its other variables go on, its network goes with it."""
     settings = dataclasses.replace(

@@ -207,7 +207,7 @@ def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     assert train("parts") == whole
     rates.clear()
     settings = dataclasses.replace(settings, decay="none")
-    train("constant")
+    train("constant", 3)
     assert {rate for one in rates for rate in one} == {1e-3}
 
 

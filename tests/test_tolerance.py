@@ -151,7 +151,6 @@ def test_compensators_stay_within_their_limits(triplet):
     assert float(none.trials.mean()) > float(found.trials.mean())
 
 
-@pytest.mark.slow
 def test_wavefront_as_built(triplet):
     found = rt.tolerance(triplet, limits="radius=0.05% thickness=0.01", criterion="wavefront", trials=64, fields=[0, 5])
     assert float(found.expected) == pytest.approx(float(found.trials.mean()), rel=0.02)
@@ -245,7 +244,6 @@ def test_limits_of_a_yield_have_it_at_less_tightness_than_a_common_factor(triple
     assert float((1 / factors).mean()) < 0.95 / low
 
 
-@pytest.mark.slow
 def test_a_yield_that_is_met_leaves_the_limits(triplet):
     found = rt.tolerance(triplet, limits="radius=0.001%", trials=0, goal=40.0, yield_=0.9)
     assert found.given is None
