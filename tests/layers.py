@@ -3,6 +3,7 @@
 import ast
 import functools
 import gc
+from collections.abc import Iterator
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
@@ -66,3 +67,11 @@ def parsed(path: Path) -> ast.Module:
         return ast.parse(path.read_text(encoding="utf-8"))
     finally:
         gc.enable()
+
+
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements of a module, class or function, with those of its branches and of what is defined in it."""
+    for part in ("body", "orelse", "handlers", "finalbody", "cases"):
+        for statement in getattr(node, part, ()):
+            yield statement
+            yield from statements(statement)

@@ -7,6 +7,7 @@ Lines are those of the .py files. A body of a function is its lines after the do
 """
 
 import ast
+import functools
 import statistics
 import sys
 from collections import Counter
@@ -113,6 +114,7 @@ def _floor(name: str) -> int:
     return FLOORS[name.split("/")[0].removesuffix(".py")]
 
 
+@functools.cache
 def walks() -> dict[str, Callable[[], object]]:
     """One refraction at a sphere, the PSF of traced rays, a cycle of optimize, and a training step."""
     lens = rt.read_lens("double_gauss").at(object_distance=25e3, fields=[0, 5])  # rays fill the stop: no warning

@@ -486,6 +486,7 @@ def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
     assert capsys.readouterr().out.split()[0] == "field_y"
 
 
+@pytest.mark.slow
 def test_through_focus_counts_its_sensor_distances():
     seen = []
 

@@ -132,6 +132,7 @@ def test_without_the_compiled_trace(cooke):
         assert np.allclose(one, other, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_aimed_rays(cooke):
     lens = cooke.at(ray_aiming="real")
     start, state = states(lens, "curvature:3")
@@ -162,6 +163,7 @@ def test_optimize_lowers_the_expectation(cooke):
     assert usual.as_built is None
 
 
+@pytest.mark.slow
 def test_weight_is_relative_to_all_rows_but_boundaries(cooke):
     """Of a merit function of spots M² is the mean square spot of the nominal lens, and E[q] counts alike."""
     lens = rt.focus(cooke, fields=[0, 8.4, 11.9]).lens

@@ -167,6 +167,7 @@ def test_nested_vmap():
     assert torch.equal(found, expected)
 
 
+@pytest.mark.slow
 def test_operator_passes_the_checks_of_torch_library():
     p = tensor([[0.0, 1.0], [0.5, 2.0], [-1.0, 0.0]])
     d = tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])

@@ -203,6 +203,7 @@ def test_edges_are_smooth_across_where_a_surface_closes(operand):
 # -- several configurations --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_zoom_is_printed_and_drawn_in_all_its_configurations(triplet):
     zoom = triplet.with_configurations(thickness={2: [6.0, 9.0], 7: [77.4, 70.0]})
     found = rt.optimize(zoom, merit="spot", vary="thickness:2@1 thickness:2@2", cycles=1)

@@ -156,6 +156,7 @@ def few(monkeypatch):
     monkeypatch.setattr(bench, "cases", published_cases)
 
 
+@pytest.mark.slow
 def test_command_writes_everything(few, tmp_path, capsys):
     names = ["bench", "psf", "hubble", "--repeats", "1", "--threads", "1"]
     files = [str(tmp_path / name) for name in ("r.json", "r.png")]

@@ -80,6 +80,7 @@ def compared(limit, lens, rays):
 # -- the limits --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", AGREES, ids=str)
 @pytest.mark.parametrize("name", ["double_gauss", "tessar", "cooke_triplet"])
 def test_safe_limit_traces_what_the_package_traces(built, name, dtype):
@@ -89,6 +90,7 @@ def test_safe_limit_traces_what_the_package_traces(built, name, dtype):
     assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[dtype]
 
 
+@pytest.mark.slow
 def test_work_of_several_threads_is_that_of_one(built):
     """So many rays that three threads get unequal shares."""
     lens = read_lens("double_gauss")
@@ -99,6 +101,7 @@ def test_work_of_several_threads_is_that_of_one(built):
     assert bool(three.valid.all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", AGREES, ids=str)
 def test_rays_fail_in_the_safe_limit_too(built, dtype):
     """Rays that miss or are totally reflected continue as axial ones; rays that failed before stay so.
@@ -122,12 +125,14 @@ def test_rays_fail_in_the_safe_limit_too(built, dtype):
     assert float((found.position - expected.position)[:, both].abs().max()) < bound
 
 
+@pytest.mark.slow
 def test_plain_limit_is_the_textbook(built):
     lens = read_lens("double_gauss")
     limit = Limit(built, lens, torch.float64, safe=False)
     assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[torch.float64]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", AGREES, ids=str)
 def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
     lens = three_aspheres()
@@ -139,6 +144,7 @@ def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
     assert not bool(Limit(built, lens, dtype, safe=True, steps=0).trace(to(rays, dtype=dtype)).valid.all())
 
 
+@pytest.mark.slow
 def test_limits_refuse_unsupported_surfaces(built):
     for lens, safe in ((read_lens("hubble"), True), (three_aspheres(), False)):
         with pytest.raises(ValueError, match="know"):

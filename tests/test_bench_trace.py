@@ -42,6 +42,7 @@ def document():
     return json.loads(out.getvalue())
 
 
+@pytest.mark.slow
 def test_json_is_one_document_with_errors_of_float32(document):
     assert document["surfaces"] == 12
     assert document["machine"]["torch threads"] == 1

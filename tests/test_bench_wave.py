@@ -91,6 +91,7 @@ def test_target_is_judged_by_the_fastest_within_the_error():
     assert found[0].opponent.dtype == "float32"
 
 
+@pytest.mark.slow
 def test_page_and_table_hold_the_figures(tmp_path):
     said = lines(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5)
     found = bench.Page(ROWS, said, {}, bench.wave_figure, ("wave_bench.md", "wave/speed"))

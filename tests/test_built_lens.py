@@ -79,6 +79,7 @@ def test_without_errors_the_camera_as_built_is_the_nominal_one(lens):
             assert float((built.kernels(DISTANCES, field, none) - expected).abs().max()) < 1e-9
 
 
+@pytest.mark.slow
 def test_the_sensor_follows_the_best_focus(lens):
     """The sensor stays as far from the least spot of the perturbed lens as it is from that of the nominal one."""
     settings = dataclasses.replace(BUILT, start="rms", fields=(0.0, 7.0))
@@ -102,6 +103,7 @@ def test_the_sensor_follows_the_best_focus(lens):
     assert torch.allclose(vertex["built"], vertex["nominal"].expand(2), atol=2e-5)  # mm
 
 
+@pytest.mark.slow
 def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
     built = camera(lens, BUILT)
     errors = rt.tolerancing.draw_errors(built.tolerances, 4)
@@ -158,6 +160,7 @@ def test_errors_are_drawn_by_the_number_of_the_sample(lens, pictures):
     assert batch(pictures, SMALL, [0], 0).errors is None
 
 
+@pytest.mark.slow
 def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
     settings = dataclasses.replace(BUILT, fields=(0.0, 7.0))
     built = camera(lens, settings)
@@ -204,6 +207,7 @@ def test_an_interrupted_training_as_built_resumes_bit_by_bit(lens, pictures, tmp
     assert any(float(parts.variables.get_parameter(name).detach()) for name in parts.variables.names)
 
 
+@pytest.mark.slow
 def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pictures):
     settings = dataclasses.replace(BUILT, crops=1)
     built, count = camera(lens, settings), 2

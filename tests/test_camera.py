@@ -205,6 +205,7 @@ def test_losses_of_shares_add_up_to_that_of_the_batch():
     assert float(sum(apart)) == pytest.approx(float(together), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_fields_take_turns():
     settings = dataclasses.replace(SMALL, fields=(0.0, 14.0), model="gaussian")
     own = camera(read_lens(LENS), settings)
@@ -234,6 +235,7 @@ def test_a_run_of_both_steps_and_its_outcome(tmp_path):
     assert list(run_model(*arguments, about={"lens": "double_gauss"}, distances=(1e4, 3e4))) == []
 
 
+@pytest.mark.slow
 def test_a_run_stopped_in_either_step_ends_as_if_it_had_not_been(tmp_path):
     train_pictures, test_pictures = split(dead_leaves(10, size=32))
 
@@ -314,6 +316,7 @@ def test_a_resumed_run_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
     assert planned[1] == planned[3] != ("drt", planned[0][1])
 
 
+@pytest.mark.slow
 def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     """From the paraxial start both go towards the lens: to the bound, and no further."""
     settings = dataclasses.replace(SMALL, bounds="sensor:57.88,58", epochs=2)
@@ -425,21 +428,24 @@ def test_a_run_writes_the_lens_that_it_learned(tmp_path):
     assert 1e-3 * distance_in_focus(learned, best_focus) == pytest.approx(found.focus_rms_m, rel=1e-9)
 
 
-def test_rho_is_of_the_paraxial_model_alone():
+@pytest.mark.parametrize(
+    "model", ["paraxial", "fourier", *(pytest.param(model, marks=pytest.mark.slow) for model in ("gaussian", "drt"))]
+)
+def test_rho_is_of_the_paraxial_model_alone(model):
     """σ = ρε: the second moment of a kernel grows with ρ², less that of the pixel; other models do not know it."""
     distances = number([20e3])
-    for model in ("paraxial", "fourier", "gaussian", "drt"):
-        narrow, wide = (
-            camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
-            for rho in (0.3, 0.6)
-        )
-        assert torch.equal(narrow, wide) == (model != "paraxial")
-        if model == "paraxial":
-            x = torch.arange(-10, 11, dtype=torch.float64)
-            blurs = [float((kernel[0, 0].sum(0) * x**2).sum().detach()) - 1 / 12 for kernel in (narrow, wide)]
-            assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
+    narrow, wide = (
+        camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
+        for rho in (0.3, 0.6)
+    )
+    assert torch.equal(narrow, wide) == (model != "paraxial")
+    if model == "paraxial":
+        x = torch.arange(-10, 11, dtype=torch.float64)
+        blurs = [float((kernel[0, 0].sum(0) * x**2).sum().detach()) - 1 / 12 for kernel in (narrow, wide)]
+        assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
 
 
+@pytest.mark.slow
 def test_training_moves_the_sensor_towards_less_loss(tmp_path):
     """From a sensor 0.3 mm too close, Adam moves away from the lens at 1 µm a step."""
     settings = dataclasses.replace(SMALL, start="57.3", epochs=5)
@@ -448,6 +454,7 @@ def test_training_moves_the_sensor_towards_less_loss(tmp_path):
     assert steps[-1][1]["sensor"] > 57.3 + 5 * MICROMETRE
 
 
+@pytest.mark.slow
 def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
     """Optima over 10 to 50 m with a 1/f² spectrum: both near 34 m paraxial, Gaussian DRT closer to the lens."""
     S = patch_spectrum(dead_leaves(8, size=64), 48)

@@ -165,6 +165,7 @@ def test_a_mosaic_is_that_of_the_place(triplet):
     assert not torch.equal(recorded[0], sensor.demosaic(sensor.sample(image[0])[None], (1, 0))[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["gaussian", pytest.param("drt", marks=pytest.mark.slow)])
 def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     """Curvatures, spaces and sensor through PSFs, noise and a network, float64."""
@@ -233,6 +234,7 @@ def test_a_kernel_is_the_same_in_any_batch_with_and_without_derivatives(triplet)
         torch.testing.assert_close(alone[0].detach(), kernels[k], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_first_example_runs():
     block = inspect.getdoc(raytrace.imaging.camera).split("\n\n")[2]
     names = {"rt": rt, "torch": torch}

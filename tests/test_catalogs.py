@@ -458,7 +458,7 @@ def mutate(content: bytes, seed: int) -> bytes:
     return bytes(changed)
 
 
-@pytest.mark.parametrize("examples", [300, pytest.param(1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [75, *(pytest.param(n, marks=pytest.mark.slow) for n in (300, 1500))])
 def test_a_damaged_file_is_a_catalog_or_a_catalog_error(examples, tmp_path):
     path = tmp_path / "damaged.agf"
 

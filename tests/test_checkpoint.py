@@ -251,6 +251,7 @@ def test_no_step_begins_that_would_not_end_in_time(seconds, monkeypatch):
     assert clock.now - 100.0 <= max(seconds, 30.0 + 21.0)  # the first evaluations with derivatives and without
 
 
+@pytest.mark.slow
 def test_cycles_on_a_narrower_beam_are_counted():
     """From a start that loses most rays the beam is opened first: those are cycles, too."""
     lens = TRIPLET.replace(1, curvature=0.06).replace(6, curvature=-0.06)

@@ -149,6 +149,7 @@ def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):
     assert float((own.kernels(z) - tilted.kernels(z)).abs().max().detach()) < 1e-6
 
 
+@pytest.mark.slow
 def test_semi_diameters_vignette_where_asked(lens):
     """Light beyond the rims of surfaces 5 and 7 is lost; the stop is as wide as the F/number says."""
     settings = dataclasses.replace(SMALL, f_number=1.9, model="drt", normalise="energy", size=61)
@@ -206,7 +207,7 @@ def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     assert train("parts") == whole
     rates.clear()
     settings = dataclasses.replace(settings, decay="none")
-    train("constant")
+    train("constant", 3)
     assert {rate for one in rates for rate in one} == {1e-3}
 
 

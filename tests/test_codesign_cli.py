@@ -217,6 +217,7 @@ def test_objects_without_an_image_are_refused(run, pictures):
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_the_learned_lens_is_a_file_that_traces(run, command, pictures):
     """Of the closed form and of a run; the file holds the sensor that was said, and its spots are small."""
     options = ("--data", pictures, *PARAXIAL, "--crops", "1", "--wavelength", "0.53", "0.62")
@@ -248,6 +249,7 @@ def test_wavelengths_of_the_file_are_an_option(run, pictures):
     assert "leave out --wavelength" in err
 
 
+@pytest.mark.slow
 def test_the_penalty_is_reported_with_the_loss(run, pictures):
     """Elements thinner than 0.3 mm and thicker than 0.9 mm, of glasses without names; on every row of the log."""
     options = ("--data", pictures, *PARAXIAL, "--crops", "1", "--vary", "sensor", "--json")
@@ -313,6 +315,7 @@ def test_progress_counts_the_batches_of_a_test(finished):
     assert any(text.startswith("refine, loss 0.") for text in shown)
 
 
+@pytest.mark.slow
 def test_the_closed_form_prints_its_course_and_draws_it_as_training_does(run, pictures, finished):
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
     code, out, err = run(*command, "-o", "closed", "--batch", "4", "--plot", "loss.png")

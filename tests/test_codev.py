@@ -555,7 +555,7 @@ def test_a_file_cut_off_anywhere_is_no_shorter_lens():
         assert len(cut.surfaces) == len(lens.surfaces)
 
 
-@pytest.mark.parametrize("examples", [60, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (60, 400))])
 def test_damaged_files_give_a_lens_that_round_trips_or_a_clear_error(examples):
     def read_one(seed, which):
         text = (ASPHERE, DOUBLE_GAUSS.format("PIM", -0.4), EVERYTHING, QUESTAR, THREE_MIRRORS)[which]

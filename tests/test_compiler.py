@@ -171,6 +171,7 @@ def plant(tmp_path_factory):
     return folder / "plant.so", mark
 
 
+@pytest.mark.slow
 def test_a_planted_library_is_not_run(tmp_path, plant):
     """Neither from a folder that others write, nor as a file that others write, nor from the current folder."""
     planted, mark = plant
@@ -198,6 +199,17 @@ def test_a_planted_library_is_not_run(tmp_path, plant):
     )
     ctypes.CDLL(str(planted))  # it does leave a mark
     assert mark.exists()
+
+
+@pytest.mark.parametrize("name", ["RAYTRACE_CACHE", "XDG_CACHE_HOME"])
+def test_a_cache_below_the_current_folder_is_ignored(name, monkeypatch, capsys):
+    for other in ("RAYTRACE_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(other, raising=False)
+    usual = library.cache_folder.__wrapped__()
+    monkeypatch.setenv(name, "cache")
+    assert library.cache_folder.__wrapped__() == usual
+    assert usual.is_absolute()
+    assert capsys.readouterr().err == f"raytrace: {name} 'cache' is not an absolute path: ignored\n"
 
 
 @pytest.fixture

@@ -107,9 +107,12 @@ def compare(seed: int, engine: str) -> int:
     return sum(len(of[name]) for name in NUMBERS)
 
 
-@pytest.mark.parametrize("engine", [pytest.param("eager", marks=pytest.mark.slow), "compiled"])
-def test_derivatives_of_random_systems_are_those_of_complex_steps(engine):
-    assert sum(compare(seed, engine) for seed in range(12)) > 300
+@pytest.mark.parametrize(
+    ("engine", "systems"),
+    [("compiled", 3), *(pytest.param(e, 12, marks=pytest.mark.slow) for e in ("eager", "compiled"))],
+)
+def test_derivatives_of_random_systems_are_those_of_complex_steps(engine, systems):
+    assert sum(compare(seed, engine) for seed in range(systems)) > 25 * systems
 
 
 @pytest.mark.slow

@@ -66,10 +66,12 @@ def test_mtf_is_that_of_single_lenses(triplet, frequency):
         )
 
 
+@pytest.mark.slow
 def test_mtf_has_exact_derivatives(triplet):
     check_gradient(triplet, "mtf@30")
 
 
+@pytest.mark.slow
 def test_changes_of_the_mtf_are_those_of_single_lenses(triplet):
     rows = rt.tolerances(triplet, "radius:3=0.1%", compensators=[])
     found = rt.tolerance(triplet, rows, criterion="mtf@30", trials=0, fields=[0, 5])
@@ -202,6 +204,7 @@ def test_change_of_the_psf_is_that_of_single_lenses(triplet, model):
         assert float(values[k]) == pytest.approx(float(change), rel=1e-9 if model == "gaussian" else 5e-3)
 
 
+@pytest.mark.slow
 def test_change_of_the_psf_has_exact_derivatives(triplet):
     check_gradient(triplet, "psf", pixel=0.004, size=33)
 

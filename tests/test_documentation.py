@@ -50,6 +50,7 @@ def test_quoted_commands_are_understood(page):
         assert build_parser().parse_args(words[1:]).command == words[1], line
 
 
+@pytest.mark.slow
 def test_the_error_axis_of_learning_has_numbers():
     focusing = script("focusing")
     figure = focusing.learn_to_focus(focusing.Setting(samples=16), steps=2, frames=(0, 2)).plot()

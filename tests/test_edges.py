@@ -216,6 +216,7 @@ def test_arms_of_a_pupil_that_is_not_clipped_are_whole():
     assert float(arms_of(batch, 16).rule(4)[1].sum()) == pytest.approx(1, abs=1e-14)
 
 
+@pytest.mark.slow
 def test_a_merit_function_of_a_clipped_spot_has_the_derivatives_of_the_light():
     """By the system aperture and the thicknesses before and behind the stop, whose rims clip at 72 % of the pupil."""
     glass, _ = clipped(*(scalar(n) for n in NUMBERS.values()), rims=2)

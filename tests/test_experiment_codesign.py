@@ -373,6 +373,7 @@ def test_blur_of_an_almost_paraxial_lens_is_that_of_similar_triangles(lens):
         assert blur == pytest.approx(expected, rel=0.01)  # spherical aberration, 1/1000 of that at F/3
 
 
+@pytest.mark.slow
 def test_time_of_a_step_leaves_the_cameras_as_they_were(lens, pictures):
     cameras = [camera(lens, dataclasses.replace(SMALL, model=model)) for model in ("paraxial", "drt")]
     before = [{key: value.clone() for key, value in own.state_dict().items()} for own in cameras]

@@ -108,6 +108,7 @@ def test_a_focusing_lens_of_other_measures(tmp_path):
         focusing.main(["--wavelength", "0.5", "0.6"])
 
 
+@pytest.mark.slow
 def test_the_script_prints_the_peak_of_the_plate(capsys, tmp_path):
     focusing.main(["--steps", "4", "--json", "-o", str(tmp_path / "lens.npy")])
     document = json.loads(capsys.readouterr().out)

@@ -233,6 +233,7 @@ def test_an_estimate_of_a_glass_by_its_code_that_is_good_is_noted():
     assert "the index of 517642 at 660 nm is estimated by a formula, to about" in report.notes[0]
 
 
+@pytest.mark.slow
 def test_estimates_of_catalog_glasses_are_as_good_as_reported():
     """Of SCHOTT's glasses at 404.7 nm: in nine of ten the estimate errs by less than three times what is said."""
     glasses = [glass for glass in shipped_catalog("SCHOTT").glasses.values() if glass.wavelength_range[0] < 0.4]

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import SHARED, for_examples, number, vector
 from problems_files import damaged, leaves, read_damaged, readable
@@ -106,7 +105,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False, width=64).map(lambda x
 positive = st.floats(min_value=5e-324, max_value=1e300)
 
 
-@pytest.mark.parametrize("examples", [30, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [10, *(pytest.param(n, marks=pytest.mark.slow) for n in (30, 100))])
 @pytest.mark.parametrize("suffix", [".zmx", ".csv"])
 def test_any_64_bit_number_survives(suffix, examples):
     double_gauss = read_lens("double_gauss")
@@ -300,7 +299,7 @@ def test_long_lines_do_not_hang(line, name):
 _ORIGINALS = [(path, path.read_bytes()) for path in (*OWN, *CORPUS)]
 
 
-@pytest.mark.parametrize("examples", [100, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [30, *(pytest.param(n, marks=pytest.mark.slow) for n in (100, 20_000))])
 def test_damaged_files_give_a_lens_or_a_clear_error(examples):
     def read_one(seed, which):
         path, content = _ORIGINALS[which]
@@ -309,10 +308,12 @@ def test_damaged_files_give_a_lens_or_a_clear_error(examples):
     for_examples(examples, read_one, seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
 
 
-@settings(max_examples=300, deadline=None)
-@given(content=st.binary(max_size=400), suffix=st.sampled_from(SUFFIXES))
-def test_any_bytes_give_a_lens_or_a_clear_error(content, suffix):
-    read_damaged(Path(f"lens{suffix}"), content)
+@pytest.mark.parametrize("examples", [75, pytest.param(300, marks=pytest.mark.slow)])
+def test_any_bytes_give_a_lens_or_a_clear_error(examples):
+    def read_one(content, suffix):
+        read_damaged(Path(f"lens{suffix}"), content)
+
+    for_examples(examples, read_one, content=st.binary(max_size=400), suffix=st.sampled_from(SUFFIXES))
 
 
 @pytest.mark.parametrize("path", OWN[:2], ids=lambda path: path.name)

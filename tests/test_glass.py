@@ -11,6 +11,7 @@ import torch
 from differences import gradcheck, gradgradcheck
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import for_examples
 
 from raytrace.materials.glass import (
     AIR,
@@ -165,21 +166,21 @@ def test_a_term_of_no_strength_has_no_pole():
     assert refractive_index(glass, float64(0.5)) == refractive_index(sellmeier([1.2], [0.01]), float64(0.5))
 
 
-@given(
-    st.sampled_from(sorted(FORMULAS)),
-    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=10, max_size=10),
-    st.floats(allow_nan=True, allow_infinity=True),
-)
-@settings(max_examples=300, deadline=None)
-def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zero_there(formula, numbers, wavelength):
-    coefficients = float64(numbers[: FORMULAS[formula].count], requires_grad=True)
-    wavelengths = float64([wavelength], requires_grad=True)
-    n = refractive_index(Glass("", formula, coefficients), wavelengths)
-    assert torch.isfinite(n).all()
-    assert (n >= 0.0).all()
-    if n == 0.0 and all(abs(number) < 1e30 for number in numbers):
-        gradients = torch.autograd.grad(n.sum(), [coefficients, wavelengths], allow_unused=True)
-        assert all((gradient == 0.0).all() for gradient in gradients if gradient is not None)
+@pytest.mark.parametrize("examples", [75, pytest.param(300, marks=pytest.mark.slow)])
+def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zero_there(examples):
+    def check(formula, numbers, wavelength):
+        coefficients = float64(numbers[: FORMULAS[formula].count], requires_grad=True)
+        wavelengths = float64([wavelength], requires_grad=True)
+        n = refractive_index(Glass("", formula, coefficients), wavelengths)
+        assert torch.isfinite(n).all()
+        assert (n >= 0.0).all()
+        if n == 0.0 and all(abs(number) < 1e30 for number in numbers):
+            gradients = torch.autograd.grad(n.sum(), [coefficients, wavelengths], allow_unused=True)
+            assert all((gradient == 0.0).all() for gradient in gradients if gradient is not None)
+
+    anything = st.floats(allow_nan=True, allow_infinity=True)
+    lists = st.lists(anything, min_size=10, max_size=10)
+    for_examples(examples, check, formula=st.sampled_from(sorted(FORMULAS)), numbers=lists, wavelength=anything)
 
 
 # -- the public functions ----------------------------------------------------------------------------------------------
@@ -243,7 +244,7 @@ def test_a_population_of_glasses_broadcasts_against_the_wavelengths():
     assert abbe_number(both).shape == (2,)
 
 
-def test_torch_func_transforms_and_compile_accept_it():
+def test_torch_func_transforms_accept_it():
     wavelengths = float64([0.45, 0.55, 0.65])
 
     def n(glass, wavelength):
@@ -254,7 +255,12 @@ def test_torch_func_transforms_and_compile_accept_it():
     assert torch.allclose(jacobian.diagonal(), slopes, rtol=1e-14, atol=0.0)  # the same sums in another order
     by_coefficient = torch.func.jacrev(lambda c: refractive_index(replace(BK7, coefficients=c), wavelengths))
     assert by_coefficient(BK7.coefficients).shape == (3, 6)
-    compiled = torch.compile(n, backend="eager", fullgraph=True)
+
+
+@pytest.mark.slow
+def test_torch_compile_accepts_it():
+    wavelengths = float64([0.45, 0.55, 0.65])
+    compiled = torch.compile(refractive_index, backend="eager", fullgraph=True)
     assert torch.equal(compiled(BK7, wavelengths), refractive_index(BK7, wavelengths))
 
 

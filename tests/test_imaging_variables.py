@@ -210,6 +210,7 @@ def test_the_projection_is_the_nearest_lens(lens):
     assert [before[name] - after[name] for name in before] == pytest.approx([0.5, 0.5], abs=1e-7)
 
 
+@pytest.mark.slow
 def test_lost_rays_are_brought_back(lens):
     """A curvature at which marginal rays miss the surface: after the projection the rays of all fields arrive."""
     prepare()

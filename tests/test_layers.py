@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from layers import FLOORS, MODULES, PACKAGE, package_of, parsed
+from layers import FLOORS, MODULES, PACKAGE, package_of, parsed, statements
 
 #: Commands, whose imports may wait until they run.
 COMMANDS = re.compile(r"cli(\.|$)")
@@ -61,7 +61,7 @@ def imported(node: ast.AST) -> list[str]:
 @functools.cache
 def imports(path: Path, *, top: bool = False) -> list[str]:
     """Modules that a file imports, or imports at its top, without those that show its values."""
-    names = [name for node in (parsed(path).body if top else ast.walk(parsed(path))) for name in imported(node)]
+    names = [name for node in (parsed(path).body if top else statements(parsed(path))) for name in imported(node)]
     module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
     return [name for name in names if name not in SHOWN_BY.get(module, ())]
 
@@ -72,17 +72,22 @@ def folder_of(name: str) -> str | None:
     return folder if folder in MODULES else None
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_imports_only_from_lower_floors(name):
-    for other in imports(MODULES[name]):
-        assert other != "<relative>", "relative imports hide the floor: write from raytrace.x import y"
-        if other in MODULES and package_of(other) != package_of(name):
-            assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other} (floor {floor(other)})"
+def modules_of(package: str) -> dict[str, Path]:
+    return {name: path for name, path in MODULES.items() if package_of(name) == package}
+
+
+@pytest.mark.parametrize("package", sorted({*map(package_of, MODULES)}))
+def test_imports_only_from_lower_floors(package):
+    for name, path in modules_of(package).items():
+        for other in imports(path):
+            assert other != "<relative>", f"{name}: relative imports hide the floor: write from raytrace.x import y"
+            if other in MODULES and package_of(other) != package:
+                assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other}, floor {floor(other)}"
 
 
 @pytest.mark.parametrize("folder", sorted({package_of(name) for name in MODULES if "." in name}))
 def test_imports_within_a_package_have_no_cycles(folder):
-    inside = {name: path for name, path in MODULES.items() if package_of(name) == folder}
+    inside = modules_of(folder)
     remaining = {
         name: [o for o in (*imports(path), *_folders(name, imports(path))) if o in inside and o != name]
         for name, path in inside.items()
@@ -100,19 +105,19 @@ def _folders(name: str, others: list[str]) -> list[str]:
     return [folder for folder in found if folder and not name.startswith(f"{folder}.")]
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if not COMMANDS.match(name)])
-def test_imports_are_at_the_top_of_the_file(name):
+@pytest.mark.parametrize("package", sorted({package_of(name) for name in MODULES if not COMMANDS.match(name)}))
+def test_imports_are_at_the_top_of_the_file(package):
     """An import inside a function, a condition or a class hides a dependency; commands alone defer them, for speed."""
-    tree = parsed(MODULES[name])
-    at_top = {id(node) for node in tree.body}
     hidden = [
-        node.lineno
-        for node in ast.walk(tree)
-        if id(node) not in at_top
+        f"{path}:{node.lineno}"
+        for name, path in modules_of(package).items()
+        if not COMMANDS.match(name)
+        for at_top in parsed(path).body
+        for node in statements(at_top)
         for other in imported(node)
         if other.split(".")[0] not in DEFERRED and other not in SHOWN_BY.get(name, ())
     ]
-    assert not hidden, f"{MODULES[name]}: imports on lines {hidden}"
+    assert not hidden, f"imports on lines {hidden}"
 
 
 @pytest.mark.parametrize("library", RESERVED)

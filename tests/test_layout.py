@@ -83,11 +83,14 @@ def test_a_wedge_of_glass_is_bounded_by_its_tilted_faces():
     assert np.abs(near[-1] - far[0])[1] < 2  # the outline goes round, and does not cross itself
 
 
-def test_views_and_colours_by_wavelength(tmp_path):
+@pytest.mark.parametrize("view", [*(pytest.param(view, marks=pytest.mark.slow) for view in ("yz", "xz")), "3d"])
+def test_views(tmp_path, view):
+    rt.layout(folded(), view=view, rays=3).plot(tmp_path / "view.png")
+    assert (tmp_path / "view.png").stat().st_size > 10_000
+
+
+def test_colours_by_wavelength():
     lens = folded()
-    for view in ("yz", "xz", "3d"):
-        rt.layout(lens, view=view, rays=3).plot(tmp_path / f"{view}.png")
-        assert (tmp_path / f"{view}.png").stat().st_size > 10_000
     with pytest.raises(ValueError, match="view=zy"):
         rt.layout(lens, view="zy")
     figure = rt.layout(lens, fields=[0], wavelengths=[0.45, 0.65], rays=3).plot()
@@ -97,6 +100,7 @@ def test_views_and_colours_by_wavelength(tmp_path):
     assert "0.45 µm" in "".join(text.get_text() for text in figure.legends[0].get_texts())
 
 
+@pytest.mark.slow
 def test_an_aperture_larger_than_its_surface_leaves_the_drawing_as_it_is():
     lens = rt.read_lens("cooke_triplet")
     for aperture in (
@@ -145,6 +149,7 @@ def test_rays_by_wavelength_show_the_spectrum_on_the_image():
     assert drawn == pytest.approx(traced.tolist(), abs=0.01)
 
 
+@pytest.mark.slow
 def test_two_planes_in_one_place_are_drawn(tmp_path):
     """The length of the figure is then that of the beam's width."""
     rows = [dict(thickness=0)]

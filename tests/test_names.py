@@ -1,11 +1,9 @@
 """Local names say what they hold."""
 
 import ast
-from pathlib import Path
 
 import pytest
-
-PACKAGE = Path(__file__).parents[1] / "raytrace"
+from layers import PACKAGE, parsed
 
 #: Words that say nothing of what a variable holds.
 EMPTY = {"one", "found", "at", "own", "of", "there", "such", "named"}
@@ -27,7 +25,7 @@ def test_local_names_say_what_they_hold(folder):
     offenders = [
         f"{path.relative_to(PACKAGE)}:{line}: {name}"
         for path in sorted((PACKAGE / folder).rglob("*.py"))
-        for name, line in bound_names(ast.parse(path.read_text(encoding="utf-8")))
+        for name, line in bound_names(parsed(path))
         if name in EMPTY
     ]
     assert not offenders, "\n".join(offenders)

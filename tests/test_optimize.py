@@ -286,6 +286,7 @@ def test_the_miss_of_a_failed_ray_has_the_derivative_of_differences(triplet):
         assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slopes[:, i], rel=1e-4, abs=1e-5 * np.abs(slopes).max())
 
 
+@pytest.mark.slow
 def test_a_lens_that_loses_rays_gets_them_back(triplet):
     lens = bent_too_far(triplet)
     before = problem_of(lens, "curvature")

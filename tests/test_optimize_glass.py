@@ -219,7 +219,7 @@ def test_a_glass_that_is_picked_up_follows(triplet):
 
 def test_the_command_prints_the_sequence(capsys):
     words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary", "curvature", "sensor", "glass:3"]
-    main([*words, "--hold", "efl=100", "--cycles", "5", "--catalog", "HOYA", "--json"])
+    main([*words, "--hold", "efl=100", "--cycles", "2", "--catalog", "HOYA", "--json"])
     document = json.loads(capsys.readouterr().out)
     steps = document["glasses"]
     assert [step["step"] for step in steps[:3]] == ["own", "model", "snap"]

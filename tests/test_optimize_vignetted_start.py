@@ -65,6 +65,7 @@ def test_never_more_light_is_lost_and_a_lens_that_loses_none_stays():
     assert problem.state(found, False).lost <= problem.state(x, False).lost
 
 
+@pytest.mark.slow
 def test_an_opening_is_watched_and_stopped_with_the_best_lens_so_far():
     lens, seen = bent(), []
 

@@ -315,6 +315,7 @@ def test_focus_report_prints_the_sensor_and_the_spot_before_and_after(double_gau
     assert {line.get_xdata()[-1] for line in by_gid(figure, "ray")} == {cross_section.vertices(found.lens)[-1]}
 
 
+@pytest.mark.slow
 def test_focus_report_takes_several_objects_and_fields(double_gauss):
     fields = number([[0.0, 0.0], [0.0, 14.0]])
     found = rt.focus(double_gauss, object_distances=[25000.0, math.inf], fields=fields, rings=4)

@@ -48,6 +48,7 @@ def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
     assert energy == pytest.approx(float(result.energy[0, 0]), abs=0.05)
 
 
+@pytest.mark.slow
 def test_ray_traced_light_fills_its_disc_evenly():
     """Far out of focus a uniform disc of 2 σ: no pattern of rays, no window that cuts it."""
     result, light, _ = seen("singlet", "drt", fields=number([[0.0], [0.0]]), object_distances=number([2000.0]))
@@ -58,6 +59,7 @@ def test_ray_traced_light_fills_its_disc_evenly():
     )
 
 
+@pytest.mark.slow
 def test_windows_are_alike_unless_the_light_is_not():
     *_, (result, light, _) = [seen("telephoto", "gaussian")]
     assert len(set(light.half.flatten().tolist())) == 1
@@ -141,6 +143,7 @@ def test_lines_are_as_wide_as_the_page():
     assert len(fill(text, 8.0, 10).split("\n")) < len(lines)
 
 
+@pytest.mark.slow
 def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
     lens = compare.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
     result = compare.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))

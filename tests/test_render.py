@@ -443,6 +443,7 @@ def test_render_chooses_sensor_grid_and_window(triplet):
     torch.testing.assert_close(encoded(linearised(picture)) * 255, picture.float(), rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_grey_picture_and_one_smaller_than_a_kernel(triplet):
     fine = rt.Sensor(size=(0.09, 0.07), pixels=(9, 7))
     image = rt.render(triplet, random(7, 9), sensor=fine, model="gaussian", tol=0.1).image
@@ -479,6 +480,7 @@ def test_the_grid_is_refined_to_the_tolerance(triplet):
     assert errors[1] <= 0.01
 
 
+@pytest.mark.slow
 def test_the_error_of_a_few_cells_is_about_that_of_all(triplet, monkeypatch):
     how = {"model": "gaussian", "illumination": False, "distortion": False, "tol": 0.05}
     few = optics(triplet, FIELD, **how)
@@ -488,6 +490,7 @@ def test_the_error_of_a_few_cells_is_about_that_of_all(triplet, monkeypatch):
     assert few.error == pytest.approx(every.error, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_kernels_are_computed_once_unless_they_are_differentiated(triplet, monkeypatch):
     places = []
@@ -500,6 +503,7 @@ def test_kernels_are_computed_once_unless_they_are_differentiated(triplet, monke
     assert optics(triplet, FIELD, object_distances=distance, **how).kernels.requires_grad
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_wavelengths_over_the_response_are_no_more_than_the_tolerance_needs(triplet):
     counts = [
@@ -648,6 +652,7 @@ def test_kernels_that_memory_does_not_hold_are_refused_first(triplet):
         optics(triplet, FIELD, model="gaussian", order=4, size=399, tol=0.3)
 
 
+@pytest.mark.slow
 def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
     """2 × 2 pixels of the scene in one of the sensor: the mean of the image on the finer pixels."""
     fine = dataclasses.replace(FIELD, pixels=(2 * COLUMNS, 2 * ROWS))

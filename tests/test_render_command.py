@@ -148,6 +148,7 @@ def test_noise_and_mosaic_are_those_of_the_sensor(command, photo):
     assert (written() != other).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_responses(command, photo):
     Path("camera.csv").write_text("wavelength_nm,r,g,b\n400,0,0,1\n500,0,1,1\n600,1,1,0\n700,1,0,0\n")
     assert command("render", LENS, photo[0], *QUICK, "--response", "camera.csv", "-o", "out.png")[0] == 0
@@ -171,17 +172,20 @@ def test_grey_pictures_of_16_bits_keep_them(command, kind):
 # -- depth
 
 
-def test_a_depth_map_is_an_array_or_a_grey_picture(command, photo):
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param(("map.npy",), marks=pytest.mark.slow), ("map.png", "--depth-range", 800, 5000)],
+    ids=["array", "picture"],
+)
+def test_a_depth_map_is_an_array_or_a_grey_picture(command, photo, words):
     map_ = np.where(np.arange(COLUMNS) < 30, 0, 255).astype(np.uint8) * np.ones((ROWS, 1), np.uint8)
     Image.fromarray(map_).save("map.png")
     distances = np.where(map_ == 0, 800.0, 5000.0)  # dark is near
     np.testing.assert_array_equal(read_depth("map.png", (800, 5000)), distances)
     np.save("map.npy", distances)
-    expected = rendered(photo[1], depth=torch.as_tensor(distances), planes=2)
-    for words in (("map.npy",), ("map.png", "--depth-range", 800, 5000)):
-        code, _, err = command("render", LENS, photo[0], *QUICK, "--planes", 2, "-o", "out.png", "--depth", *words)
-        assert code == 0, err
-        assert_written(expected)
+    code, _, err = command("render", LENS, photo[0], *QUICK, "--planes", 2, "-o", "out.png", "--depth", *words)
+    assert code == 0, err
+    assert_written(rendered(photo[1], depth=torch.as_tensor(distances), planes=2))
 
 
 # -- several pictures, figures
@@ -237,6 +241,7 @@ def test_the_figure_shows_details_at_their_places_and_the_kernels_there():
             np.testing.assert_allclose(found, one, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_window_of_the_kernels(command, photo):
     assert command("render", LENS, photo[0], *QUICK, "--size", 31, "-o", "out.png")[0] == 0
     assert_written(rendered(photo[1], size=31))

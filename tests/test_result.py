@@ -172,7 +172,8 @@ def test_values_and_batches_print_large_tensors_by_shape_and_range():
         rt.trace(lens),
         rt.first_order(batch),
     ]
-    values += [rt.render("singlet", torch.rand(1, 16, 16), sensor=rt.Sensor(size=(1, 1), pixels=(16, 16)))]
+    chip = rt.Sensor(size=(1, 1), pixels=(16, 16))
+    values += [rt.render("singlet", torch.rand(1, 16, 16), sensor=chip, model="gaussian", tol=0.3)]
     for value in values:
         assert "tensor(" not in repr(value), type(value)
         assert len(repr(value)) < 2500, type(value)

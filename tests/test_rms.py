@@ -87,6 +87,7 @@ def test_the_command(options, capsys, tmp_path):
     assert "all, weighted" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_zernike_coefficients_are_a_table(capsys):
     """Fringe terms are those of Noll's polynomials times their value at the rim; a lens on the axis has no coma."""
     assert main(["wavefront", "tessar", "--field", "0", "--numbering", "fringe", "--terms", "9", "--size", "8"]) == 0

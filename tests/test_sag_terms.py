@@ -310,6 +310,7 @@ def singlet(sag_terms, **others):
     return lens([front, surface(-0.02, 48.0)], aperture=("entrance_pupil_diameter", 6.0), **others)
 
 
+@pytest.mark.slow
 def test_sag_terms_is_not_round_whatever_its_numbers():
     """Astigmatism seen by one meridian would look round; the covariance of all models shows both axes."""
     round_lens, astigmatic = singlet(None), singlet(noll(z6=2e-3))

@@ -119,15 +119,20 @@ def check_scaling(case: dict, power: int, dtype: torch.dtype, *, tolerance: floa
             assert abs(big[output, name] - wanted) <= tolerance * abs(wanted) + floor, (output, name)
 
 
-@both_engines
-@pytest.mark.parametrize("power", [398, -398])
+def up_and_down(power: int):
+    """Of a test: the scale 2^power by one engine and 2^-power by the other, each by both in the slow suite."""
+    quick, slow = ((power, "compiled"), (-power, "eager")), ((power, "eager"), (-power, "compiled"))
+    listed = [*quick, *(pytest.param(*case, marks=pytest.mark.slow) for case in slow)]
+    return pytest.mark.parametrize(("power", "engine"), listed, indirect=["engine"])
+
+
+@up_and_down(398)
 @pytest.mark.parametrize("case", usual(1e30), ids=lambda case: case["id"])
 def test_every_derivative_follows_the_scale(case, power, engine):
     check_scaling(case, power, torch.float64, tolerance=1e-9)
 
 
-@both_engines
-@pytest.mark.parametrize("power", [300, -300])
+@up_and_down(300)
 @pytest.mark.parametrize("case", ASPHERES, ids=lambda case: case["id"])
 def test_those_of_a_fourth_power_do(case, power, engine):
     """Higher coefficients themselves leave the range of numbers. Rays that miss without the others are left out."""
@@ -139,8 +144,7 @@ def test_those_of_a_fourth_power_do(case, power, engine):
     check_scaling(case, power, torch.float64, tolerance=1e-9)
 
 
-@both_engines
-@pytest.mark.parametrize("power", [36, -36])
+@up_and_down(36)
 @pytest.mark.parametrize("case", usual(1e3), ids=lambda case: case["id"])
 def test_in_float32_too(case, power, engine):
     check_scaling(case, power, torch.float32, tolerance=2e-3)

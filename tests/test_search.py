@@ -145,6 +145,7 @@ def test_a_lens_and_the_same_turned_round_are_one():
     assert not minima.add(ended([0.2, -0.5], 1.0), "b", 2)
 
 
+@pytest.mark.slow
 def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
     assert len(found.lenses) == 1
     assert found.times_reached.tolist() == [8]  # four starts that are followed, and four hops
@@ -388,6 +389,7 @@ def test_processes_find_the_minima_of_one(plate, found, tmp_path):
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_folder_holds_lenses_a_table_and_figures(found, tmp_path):
     found.save(tmp_path)
     (tmp_path / "minimum_99.zmx").write_text("of a longer search")
@@ -437,6 +439,7 @@ def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_pat
     assert said in command_line("search", "plate.csv", *words).error
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_plane_plates_have_no_focal_length_and_no_warning():
     """Of a plate f = ∞ without a derivative, in a row and in a search, where the power that f has is held."""

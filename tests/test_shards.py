@@ -1,8 +1,10 @@
 """Processes of torchrun: what they compute together is what one computes, and they end together."""
 
 import json
+import multiprocessing
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -81,7 +83,7 @@ def cases(names: tuple[str, ...]) -> dict[str, dict[str, np.ndarray]]:
 
 
 def work(folder: str, names: tuple[str, ...]) -> None:
-    """Each process of `test_two_processes_compute_and_train_as_one_does`: kernels, ten steps of training, an error."""
+    """Each process of the tests of two: kernels, ten steps of training, an error."""
     with shards.processes() as share:
         weights = fit(Path(folder, "training of two"), 10)
         if share.rank == 0:
@@ -136,18 +138,46 @@ def run_function(call: str, *, folder: Path, processes: int = 2) -> subprocess.C
 # ---------------------------------------------------------------- several processes
 
 
-@pytest.mark.parametrize(
-    "names",
-    [("fields", "distances", "wavelengths", "paraxial"), pytest.param(tuple(CASES), marks=pytest.mark.slow)],
-    ids=["one of each axis", "all"],
-)
-def test_two_processes_compute_and_train_as_one_does(tmp_path, names):
-    """One start of torchrun. Kernels of every model, each axis of a scene cut in turn, to rounding in both processes;
+EACH_AXIS = ("fields", "distances", "wavelengths", "paraxial")
 
-    weights after ten steps of Adam, to 1e-12; an error of one process is raised in all.
-    """
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [EACH_AXIS, tuple(CASES)], ids=["one of each axis", "all"])
+def test_two_processes_compute_and_train_as_one_does(tmp_path, names):
+    """One start of torchrun. Kernels of every model, each axis of a scene cut in turn."""
     done = run_function(f"work({str(tmp_path)!r}, {names!r})", folder=tmp_path)
     assert done.returncode == 0, done.stderr
+    check_work(tmp_path, names)
+
+
+def work_in_a_fork(rank: int, port: int, folder: str) -> None:
+    """The work of one of two processes, in the environment that torchrun would give it."""
+    words = {"TORCHELASTIC_RUN_ID": "test", "MASTER_ADDR": "localhost", "MASTER_PORT": port}
+    numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2}
+    os.environ |= {name: str(value) for name, value in (words | numbers).items()}
+    torch.set_num_threads(1)  # a fork has none of the other threads
+    work(folder, EACH_AXIS)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="autograd does not fork where there is a GPU")
+def test_two_forks_compute_and_train_as_one_process_does(tmp_path):
+    """Without torchrun, which would load torch three times anew."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    context = multiprocessing.get_context("fork")
+    forks = [context.Process(target=work_in_a_fork, args=(rank, port, str(tmp_path))) for rank in range(2)]
+    for fork in forks:
+        fork.start()
+    for fork in forks:
+        fork.join(120)
+    assert [fork.exitcode for fork in forks] == [0, 0]
+    check_work(tmp_path, EACH_AXIS)
+
+
+def check_work(tmp_path, names):
+    """Kernels to rounding in both processes; weights after ten steps of Adam, to 1e-12; an error of one process is
+    raised in all."""
     together = [np.load(tmp_path / f"{rank}.npz") for rank in range(2)]
     for name, numbers in cases(names).items():
         for key, expected in numbers.items():

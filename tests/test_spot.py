@@ -217,6 +217,7 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     assert main([*arguments, "--rays", "1000", "--reference", "chief"]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::raytrace.UnfilledStop")
 def test_spots_of_a_batch_are_those_of_its_lenses():
     """Irregular surfaces, some lenses clipped; and a batch of none."""

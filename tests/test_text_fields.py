@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from problems import for_examples
 
 from raytrace.io import LensFileError, LensFileWarning, read_lens, source, write_lens
 from raytrace.io.frames import lens_from_frame, to_frame
@@ -21,9 +22,11 @@ NASTY = st.text(
 )
 
 
+LENS = read_lens(LENSES / "double_gauss.zmx")
+
+
 def with_texts(name: str, note: str, comment: str):
-    lens = read_lens(LENSES / "double_gauss.zmx")
-    return dataclasses.replace(lens.replace(3, comment=comment), name=name, notes=(note, "between", note))
+    return dataclasses.replace(LENS.replace(3, comment=comment), name=name, notes=(note, "between", note))
 
 
 def texts_of(lens) -> tuple:
@@ -78,10 +81,12 @@ def test_any_text_round_trips_through_pandas(name, note, comment):
     assert texts_of(lens_from_frame(to_frame(lens))) == texts_of(lens)
 
 
-@settings(max_examples=500)
-@given(st.lists(NASTY.filter(bool), min_size=1))
-def test_words_round_trip(listed):
-    assert source.words(" ".join(map(source.word, listed))) == listed
+@pytest.mark.parametrize("examples", [100, pytest.param(500, marks=pytest.mark.slow)])
+def test_words_round_trip(examples):
+    def round_trip(listed):
+        assert source.words(" ".join(map(source.word, listed))) == listed
+
+    for_examples(examples, round_trip, listed=st.lists(NASTY.filter(bool), min_size=1))
 
 
 def test_plain_texts_stay_plain():

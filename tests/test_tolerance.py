@@ -101,6 +101,7 @@ def test_rss_is_as_opticstudio_prints_it(built):
     assert float(built.estimated) == pytest.approx(float(built.nominal + rss), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_trial_is_the_same_in_any_study(triplet, built):
     fewer = rt.tolerance(triplet, limits=LIMITS, trials=260)
     torch.testing.assert_close(fewer.trials, built.trials[:260], rtol=1e-10, atol=0)
@@ -265,6 +266,7 @@ def test_second_order_of_each_limit(built):
     assert torch.allclose(table["predicted"], table["trials"], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_perturbed_lenses_find_their_stop_as_the_nominal_one():
     lens = rt.read_lens("cooke_triplet")  # auto: off, whose elements are tilted then
     rows = rt.tolerances(lens, grade="precision", compensators=[])
@@ -347,6 +349,7 @@ def clipped_triplet():
     return lens
 
 
+@pytest.mark.slow
 def test_the_nominal_criterion_of_a_clipped_lens_is_that_of_its_clear_pupil():
     lens = clipped_triplet()
     rows = rt.tolerances(lens, "thickness=0.01", compensators=[])
@@ -357,6 +360,7 @@ def test_the_nominal_criterion_of_a_clipped_lens_is_that_of_its_clear_pupil():
     assert float(found.nominal) == pytest.approx(1e3 * root, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_light_that_a_lens_loses_is_counted_and_bounded():
     """A rim that moves across the beam by 4 mm: its share of the pupil of the axial field is that of two discs."""
     lens = rt.lens(
@@ -406,6 +410,7 @@ def test_all_configurations_are_judged():
         assert float(found.nominal + found.maximum[k]) == pytest.approx((sum(squares) / 2) ** 0.5, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_configurations_count_by_their_weights():
     """CWGT 1 and 3: q is the mean by weight; of weights 0 and 1 that of the second one alone; of 0 and 0 the mean."""
     lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 14.0]})
@@ -427,6 +432,7 @@ def bare(lens):
     return dataclasses.replace(lens, operands=(), current_configuration=1)
 
 
+@pytest.mark.slow
 def test_a_compensator_of_a_configuration_adjusts_it_alone():
     """As CMCO: each configuration has its own sensor distance, so that each is at its best alone."""
     lens = rt.read_lens("cooke_triplet").with_configurations(thickness={2: [12.93, 12.6], 7: [77.4, 77.0]})
@@ -449,6 +455,7 @@ def test_a_compensator_of_a_configuration_adjusts_it_alone():
         )
 
 
+@pytest.mark.slow
 def test_tolerances_of_a_file_have_its_compensators_alone(tmp_path):
     """The same analysis by the lens, by its tolerances as read, and by the command."""
     lines = ["TOL TTHI 2 3 -0.05 0.05 0 0 0", "TOL TRAD 1 0 -0.1 0.1 0 0 0"]

@@ -56,6 +56,7 @@ def test_absent_terms_vary_from_zero(lens):
     assert float((same - other).abs().max()) < 1e-12
 
 
+@pytest.mark.slow
 def test_pose_and_shape_of_the_image_vary(lens):
     """With the derivatives of differences, of rays on the image, their path and their wavefront."""
     words = "tilt:12 decentre:12 tilt_z:12 z:12 curvature:12 conic:12"

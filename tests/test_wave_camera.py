@@ -159,6 +159,7 @@ def test_a_run_is_that_of_its_pictures(tmp_path):
     learn(settings, SMALL, LEAVES, tmp_path, "begun")
 
 
+@pytest.mark.slow
 def test_pictures_teach_the_filter_of_the_original(tmp_path):
     """Weight and target depth move with the heights, and the loss of the same draws falls."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="towards", steps=25, batch=4)
@@ -173,6 +174,7 @@ def test_pictures_teach_the_filter_of_the_original(tmp_path):
     assert np.mean(losses[-8:]) < np.mean(losses[:8])
 
 
+@pytest.mark.slow
 def test_a_network_learns_behind_the_filter(tmp_path):
     """It begins as nothing at all, and both it and the element move."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="network", steps=4, batch=2)

@@ -46,6 +46,7 @@ def library(elements, depths, wavelengths, size=128):
     return psf(WaveScene(elements, number(35.5), number(depths), number(wavelengths), grid(number(0.00369), size)))
 
 
+@pytest.mark.slow
 def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):
     code, out, err = run("psf", "--element", "singlet", *FORM, "--json", "-o", "psf.npz", "--plot", "psf.png")
     assert code == 0, err

@@ -61,6 +61,7 @@ def test_samples_just_enough_are_taken_and_are_right():
     assert relative(psf(s, engine="pupil", samples=108).kernel, psf(s).kernel) < 1e-2
 
 
+@pytest.mark.slow
 def test_an_undersampled_converging_field_is_warned_of_and_is_wrong():
     """The 3.69 µm grid of the original at 460 nm: λz/D is 3.27 µm, and the rim is aliased."""
     s = original(size=32)

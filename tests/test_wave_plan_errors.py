@@ -170,6 +170,7 @@ def test_a_kinoform_under_a_cubic_plate_is_computed_without_cutting_its_rings(ex
     assert relative(result.kernel, polar_sum(seen, nodes=4, arms=768)) < 0.5 * result.error
 
 
+@pytest.mark.slow
 def test_a_mixed_scene_does_not_depend_on_its_band():
     """Twice the band of the round part, cells and radii with it: the same kernel to a tenth of what is predicted."""
     seen = scene(*baseline("cubic", aim(radius=0.2)), depths=(1000.0,), wavelengths=GREEN, size=8)
