@@ -65,15 +65,15 @@ def test_an_octant_is_the_closed_form_of_the_kernels(name):
     assert float((own - slope).norm()) < 100 * tolerance * float(slope.norm())
     for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 1e-5)):
         kernels = camera.element_kernels(SMALL.depths)
-        part = Octant(kernels.scene, kernels.plan, 128, dtype=dtype)
-        error = part.error(part.transfer(kernels.scene), S, SMALL.noise)
+        part = Octant(kernels.scene, kernels.plan, S, dtype=dtype)
+        error = part.error(part.transfer(kernels.scene), SMALL.noise)
         torch.testing.assert_close(error, expected, rtol=tolerance, atol=0)
 
 
 def test_frequencies_of_the_octant_are_those_of_the_kernels():
     camera = SMALL.camera(baseline("fresnel", aim()))
     own = camera.element_kernels(SMALL.depths).scene
-    result = Octant(own, plan(own), 128).transfer(own)
+    result = Octant(own, plan(own), S).transfer(own)
     H = transfer(camera, 128, SMALL.depths).real
     a, b = torch.triu_indices(65, 65)
     torch.testing.assert_close(result, H[..., a, b], rtol=0, atol=1e-7)

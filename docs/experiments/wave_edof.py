@@ -34,7 +34,7 @@ from raytrace.cli.wave_design import LIMIT, PICTURES
 from raytrace.cli.wave_run import LEAVES, WIDE, learn, training_pictures
 from raytrace.files import table as csv
 from raytrace.imaging.closed_form import camera_error
-from raytrace.imaging.image import transfer_functions, with_haze
+from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
 from raytrace.imaging.render import ImageFormation, render
 from raytrace.imaging.restoration import depth_invariant_wiener, power_spectrum, psnr, restore
@@ -270,8 +270,8 @@ def deep(elements: Mapping[str, Sequence[Element]], config: WaveCameraConfig, *,
 
 def transfer_of(formation: ImageFormation) -> Tensor:
     """H (D, C, rows, columns) of the kernels of elements, columns towards +x; light beyond the window is haze."""
-    kernels, size = (1 - formation.haze)[..., None, None] * formation.kernels[0, 0].flip(-1), formation.sensor.pixels
-    return transfer_functions(with_haze(kernels, size[::-1]), size[::-1])
+    kernels = (1 - formation.haze)[..., None, None] * formation.kernels[0, 0].flip(-1)
+    return transfer_functions(kernels, formation.sensor.pixels[::-1], haze=True)
 
 
 def noise_like(like: Tensor, config: WaveCameraConfig, seed: int) -> Tensor:

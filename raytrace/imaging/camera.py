@@ -63,7 +63,7 @@ from raytrace.imaging.field_kernels import (
     warn_of_dark_places,
 )
 from raytrace.imaging.filters import LinearFilter
-from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions, with_haze
+from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions
 from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
 from raytrace.imaging.restoration import restore
@@ -394,6 +394,7 @@ class Camera(nn.Module, Generic[V]):
         if points is not None:
             check_points(points, count)
             points, lens = points.to(self.fields), by_angle(nominal)
+        built = None if errors is None else self._built(nominal, errors)
         about: FieldKernels | ElementKernels
         if isinstance(self.variables, PhaseVariables):
             about = self.element_kernels(distances, draw=draw)
@@ -412,13 +413,14 @@ class Camera(nn.Module, Generic[V]):
                 normalise=self.normalise,
                 memo=self._memo if points is None and errors is None else None,
             )
-        if errors is None and points is not None:
+        if isinstance(about, ElementKernels):  # alike at all places
+            kernels = about.paired(self.fields)
+        elif errors is None and points is not None:
             kernels = about.paired(points)
         else:
             at_field = self._of_field(self.fields, field, count)
             fields = at_field if points is None else self.sensor.fields(lens, points)
-            if errors is not None:
-                built = self._built(nominal, errors)
+            if built is not None:
                 if built.count not in (None, count):
                     raise ValueError(
                         f"errors of {built.count} lenses at {count} object distances: expected one for each"
@@ -493,9 +495,9 @@ class Camera(nn.Module, Generic[V]):
             return image
         return image + (1 - kernels.sum((-2, -1), keepdim=True)) * light.mean((-2, -1), keepdim=True)
 
-    def of_period(self, kernels: Tensor, size: int | Sequence[int]) -> Tensor:
-        """Kernels (..., h, w) of the camera for closed forms and filters of this size: with haze over a period."""
-        return with_haze(kernels, size) if self.normalise == "haze" else kernels
+    def transfer(self, kernels: Tensor, size: int | Sequence[int]) -> Tensor:
+        """H (..., rows, columns) of kernels (..., h, w) of the camera on periodic images of this size, with haze."""
+        return transfer_functions(kernels, size, haze=self.normalise == "haze")
 
     def _of_channels(self, picture: Tensor, distances: Tensor) -> Tensor:
         """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,). Raises ValueError."""
@@ -539,15 +541,15 @@ class Camera(nn.Module, Generic[V]):
         alone = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "size": self.size}
         return render(self.elements(), scene, depth=depth, **{**alone, **options})
 
-    def restore(self, image: Tensor, kernels: Tensor | None = None) -> Tensor:
+    def restore(self, image: Tensor, transfer: Tensor | None = None) -> Tensor:
         """The estimate (B, C, h, w) of filter and network from a noisy image.
 
-        kernels: (Z, C, h, w) of the distances of the filter, if they are known.
+        transfer: (Z, C, rows, columns) at the distances of the filter, if it is known.
         """
         if self.filter is not None:
-            kernels = self.kernels(self.filter.distances) if kernels is None else kernels
-            size = self.filter.spectrum.shape[-2:]
-            G = self.filter(transfer_functions(self.of_period(kernels, size), size), self.sensor)
+            if transfer is None:
+                transfer = self.transfer(self.kernels(self.filter.distances), self.filter.spectrum.shape[-2:])
+            G = self.filter(transfer, self.sensor)
             image = restore(image, G, boundary="circular" if self.boundary == "circular" else "taper")
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
             image = as_picture(image, "image")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.image import decoded, transfer_functions
+from raytrace.imaging.image import decoded
 from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.octant import octant_error
 from raytrace.imaging.pictures import Pictures, crop
@@ -73,10 +73,10 @@ def camera_error(
         error = octant_error(camera.element_kernels(distances, draw=draw), spectrum, sigma)
         if error is not None:
             return error
-    kernels = camera.of_period(camera.kernels_over_field(distances, draw=draw), spectrum.shape[-2:])
+    kernels, haze = camera.kernels_over_field(distances, draw=draw), camera.normalise == "haze"
     if spectrum.dim() == 4:
-        return joint_kernel_error(kernels, spectrum, sigma).mean()
-    return kernel_error(kernels, spectrum.to(kernels.dtype), sigma).mean()
+        return joint_kernel_error(kernels, spectrum, sigma, haze=haze).mean()
+    return kernel_error(kernels, spectrum.to(kernels.dtype), sigma, haze=haze).mean()
 
 
 @torch.no_grad()
@@ -92,7 +92,7 @@ def field_filters(
     distances = even_distances(camera) if distances is None else distances
     spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
-    transfer = transfer_functions(camera.of_period(kernels, spectrum.shape[-2:]), spectrum.shape[-2:])
+    transfer = camera.transfer(kernels, spectrum.shape[-2:])
     if spectrum.dim() == 4:
         return joint_wiener(transfer, spectrum, camera.sensor.noise_deviation(spectrum))
     return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), camera.sensor.noise_deviation(spectrum))

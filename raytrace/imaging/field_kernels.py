@@ -367,7 +367,7 @@ class ElementKernels:
 
     def of_light(self, light: Tensor) -> Tensor:
         """Kernels (D, C, size, size) of `light`."""
-        kernels = torch.einsum("cw,dwij->dcij", self.weights.to(light), light).flip(-1)
+        kernels = (self.weights.to(light) @ light.flatten(2)).unflatten(2, light.shape[2:]).flip(-1)
         return _of_sum_1(kernels) if self.normalise == "window" else kernels
 
     def at(self, points: Tensor) -> Tensor:
@@ -378,18 +378,16 @@ class ElementKernels:
     def paired(self, points: Tensor) -> Tensor:
         """Kernels (N, C, size, size) of pairs: places (2, N) mm, each with its object distance of (N,)."""
         distances, which = _distinct(self.object_distances)
-        return dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0].index_select(0, which)
-
-    def of_pairs(self, fields: Tensor) -> Tensor:
-        """`paired` of field points (2, N)."""
-        return self.paired(fields)
+        kernels = dataclasses.replace(self, object_distances=distances).at(points[:, :1])[0]
+        return kernels if len(kernels) == len(which) else kernels.index_select(0, which)
 
 
 def _distinct(distances: Tensor) -> tuple[Tensor, Tensor]:
     """Distinct distances and, of each distance, its number among them; all of them where they have derivatives."""
-    if varies(distances):
+    some, which = distances.detach().unique(return_inverse=True)
+    if varies(distances) or len(some) == len(distances):
         return distances, torch.arange(len(distances), device=distances.device)
-    return distances.unique(return_inverse=True)
+    return some, which
 
 
 def channel_moments(

@@ -105,11 +105,14 @@ def visible(picture: Tensor, spot: Sequence[int]) -> Tensor:
     return picture[..., top : rows - h // 2, left : columns - w // 2]
 
 
-def transfer_functions(kernels: Tensor, size: int | Sequence[int], *, origin: str = "pixel") -> Tensor:
+def transfer_functions(
+    kernels: Tensor, size: int | Sequence[int], *, origin: str = "pixel", haze: bool = False
+) -> Tensor:
     """H (..., rows, columns), Fourier transforms of kernels (..., h, w) on images of that size, ordered as by `fft2`.
 
     origin: as for `blur`, which multiplies by them for boundary "circular". At origin "grid" an even kernel is 0 at the
-    Nyquist frequency, where a half-pixel shift is undefined.
+    Nyquist frequency, where a half-pixel shift is undefined. haze: light beyond the window of kernels, whose sum is the
+    share of all light, lies evenly over the image: H is 1 at frequency 0.
     """
     shape = (size, size) if isinstance(size, int) else (size[0], size[1])
     _check_choice(origin, _ORIGINS, "origin")
@@ -118,20 +121,9 @@ def transfer_functions(kernels: Tensor, size: int | Sequence[int], *, origin: st
     padded = torch.nn.functional.pad(kernels, (0, shape[1] - w, 0, shape[0] - h))
     placed = torch.roll(padded, (-(h // 2), -(w // 2)), (-2, -1))
     transfer = torch.fft.fft2(placed)
+    if haze:
+        transfer[..., 0, 0] = 1
     return transfer if origin == "pixel" else transfer * _half_pixels(kernels, shape)
-
-
-def with_haze(kernels: Tensor, size: int | Sequence[int]) -> Tensor:
-    """Kernels (..., rows, columns) of a whole periodic image: the light beyond their window, 1 - Σ h, is an even haze.
-
-    kernels: (..., h, w), of the share of all light. Their transfer functions are 1 at frequency 0.
-    """
-    rows, columns = (size, size) if isinstance(size, int) else size
-    h, w = kernels.shape[-2:]
-    check_fit((h, w), (rows, columns))
-    top, left = rows // 2 - h // 2, columns // 2 - w // 2
-    beyond = 1 - kernels.sum((-2, -1), keepdim=True)
-    return torch.nn.functional.pad(kernels, (left, columns - w - left, top, rows - h - top)) + beyond / (rows * columns)
 
 
 def extend(picture: Tensor, shape: Sequence[int], *, boundary: str) -> Tensor:

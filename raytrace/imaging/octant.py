@@ -27,25 +27,27 @@ _CHUNK = 32  # radii whose pixels are computed at once
 
 
 class Octant:
-    """The operators of round elements that do not depend on their heights, for pictures of size × size pixels.
+    """The operators of round elements that do not depend on their heights, for pictures of a spectrum.
 
-    scene, plan: of the radial engine; later elements may have other heights, with steps at the same radii. dtype: of
-    all sums; phases have that of the scene.
+    scene, plan: of the radial engine; later elements may have other heights, with steps at the same radii. spectrum: S
+    (size, size) of pictures that equal their mirror images; dtype: of all sums; phases have that of the scene.
     """
 
-    def __init__(self, scene: WaveScene, plan: Plan, size: int, *, dtype: torch.dtype = torch.float64):
+    def __init__(self, scene: WaveScene, plan: Plan, spectrum: Tensor, *, dtype: torch.dtype = torch.float64):
+        size = spectrum.shape[-1]
         order, cutoff = propagation.order_of(scene, plan.nodes), propagation.cutoff(scene)
         half, _ = radii_of_waves(scene.grid, 0.5 * cutoff, order)
         self._r, bessel = propagation.to_radii(scene, half, plan.samples)
         self._sphere, self._bessel = spheres(scene, self._r * self._r), bessel.to(dtype)
-        rows, pitch = scene.grid.rows, float(scene.grid.pitch)
+        pixels, pitch = scene.grid.rows, float(scene.grid.pitch)
         radii = radii_of_waves(scene.grid, cutoff, order)[0] / (pitch * reach(scene.grid))
         self._between = _between(radii, len(half)).to(dtype)
-        self._to_octant = _to_octant(rows, pitch, cutoff, order, size).to(dtype)
-        self._rows, self._columns = _octant(size)
-        # (2, F): the weight in a mean over all frequencies of each one of the octant, and of its transpose.
-        alone = [torch.where((n == 0) | (2 * n == size), 1.0, 2.0).double() for n in (self._rows, self._columns)]
-        diagonal = torch.where(self._rows == self._columns, 0.5, 1.0)
+        self._to_octant = _to_octant(pixels, pitch, cutoff, order, size).to(dtype)
+        rows, columns = _octant(size)
+        # (2, F): of each frequency of the octant and of its transpose the power, and the weight in a mean over all.
+        self._spectrum = torch.stack([spectrum[rows, columns], spectrum[columns, rows]])
+        alone = [torch.where((n == 0) | (2 * n == size), 1.0, 2.0).double() for n in (rows, columns)]
+        diagonal = torch.where(rows == columns, 0.5, 1.0)
         self._weight = (alone[0] * alone[1] * diagonal / size**2).expand(2, -1)
 
     def transfer(self, scene: WaveScene) -> Tensor:
@@ -56,11 +58,9 @@ class Octant:
         H = (light.flatten(0, 1) @ self._to_octant.T).unflatten(0, light.shape[:2]).to(self._r.dtype)
         return torch.cat([torch.ones_like(H[..., :1]), H[..., 1:]], -1)
 
-    def error(self, transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-        """Mean square error behind the best depth-invariant filter, mean over channels; transfer: (D, C, F); spectrum:
-        S (size, size) of pictures that equal their mirror images."""
-        both = torch.stack([spectrum[self._rows, self._columns], spectrum[self._columns, self._rows]])
-        density = depth_invariant_density(transfer[:, :, None], both, sigma)
+    def error(self, transfer: Tensor, sigma: Tensor | float) -> Tensor:
+        """Mean square error behind the best depth-invariant filter, mean over channels; transfer: (D, C, F)."""
+        density = depth_invariant_density(transfer[:, :, None], self._spectrum, sigma)
         return (self._weight * density).sum((-2, -1)).mean()
 
 
@@ -74,13 +74,12 @@ def octant_error(kernels: ElementKernels, spectrum: Tensor, sigma: Tensor) -> Te
         # Rings in single precision: their sums take most of the time, and Adam needs no more.
         is_rings = isinstance(scene.elements[0].profile, Rings)
         dtype = torch.float32 if is_rings else torch.float64
-        return Octant(scene, plan, spectrum.shape[-1], dtype=dtype) if fits(scene, plan, spectrum) else None
+        return Octant(scene, plan, spectrum, dtype=dtype) if fits(scene, plan, spectrum) else None
 
     part = remembered(kernels.memo, scene, ("octant", plan), octant, spectrum)
     if part is None:
         return None
-    transfer = torch.einsum("cw,dwf->dcf", kernels.weights, part.transfer(scene))
-    return part.error(transfer, spectrum, sigma)
+    return part.error(kernels.weights @ part.transfer(scene), sigma)
 
 
 def _between(places: Tensor, count: int) -> Tensor:

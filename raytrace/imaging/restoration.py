@@ -98,18 +98,18 @@ def depth_invariant_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | 
     return spectrum * torch.where(total != 0, safe_divide(spectrum * spread + noise, total), 1.0)
 
 
-def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float, *, haze: bool = False) -> Tensor:
     """`depth_invariant_error` (...) of kernels (Z, ..., h, w), from half of the frequencies.
 
     Images and kernels are real, so that S and |H| are equal at f and -f; the position of the kernels' centre is
-    irrelevant as long as it is the same for all Z.
+    irrelevant as long as it is the same for all Z. haze: as for `transfer_functions`.
     """
-    transfer, weight = _half_transfer(kernels, spectrum)
+    transfer, weight = _half_transfer(kernels, spectrum, haze)
     density = depth_invariant_density(transfer, spectrum[..., : len(weight)], sigma)
     return (weight * density).mean((-2, -1))
 
 
-def _half_transfer(kernels: Tensor, spectrum: Tensor) -> tuple[Tensor, Tensor]:
+def _half_transfer(kernels: Tensor, spectrum: Tensor, haze: bool) -> tuple[Tensor, Tensor]:
     """Transfer functions (..., rows, half) as by `rfft2`, and weights (half,) of columns, whose mean is 1."""
     rows, columns = spectrum.shape[-2:]
     check_fit(kernels.shape[-2:], (rows, columns))
@@ -117,7 +117,10 @@ def _half_transfer(kernels: Tensor, spectrum: Tensor) -> tuple[Tensor, Tensor]:
     place = torch.arange(half, device=spectrum.device)
     # Every column counts for its mirror image too, except 0 and the Nyquist frequency.
     weight = torch.where((place == 0) | (2 * place == columns), 1.0, 2.0).to(spectrum.real.dtype) * (half / columns)
-    return torch.fft.rfft2(kernels, s=(rows, columns)), weight
+    transfer = torch.fft.rfft2(kernels, s=(rows, columns))
+    if haze:
+        transfer[..., 0, 0] = 1
+    return transfer, weight
 
 
 # -- joint filters of several channels
@@ -167,13 +170,13 @@ def joint_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> 
     return sum((_square(column) for column in _joint_steps(transfer, spectrum, sigma)[0]), torch.zeros(()))
 
 
-def joint_kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+def joint_kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float, *, haze: bool = False) -> Tensor:
     """`joint_error` (..., C) of kernels (Z, ..., C, h, w), from half of the frequencies, as `kernel_error`.
 
     Kernels of all channels must have a common centre: lateral colour shifts them.
     """
     _check_channels(kernels, spectrum)
-    transfer, weight = _half_transfer(kernels, spectrum)
+    transfer, weight = _half_transfer(kernels, spectrum, haze)
     return (weight * joint_density(transfer, spectrum[..., : len(weight)], sigma)).mean((-2, -1))
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.image import extend, transfer_functions
+from raytrace.imaging.image import extend
 from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, power_spectrum, psnr, wiener
 from raytrace.imaging.sensor import Sensor
@@ -93,7 +93,7 @@ def depth_text(depth: float, infinity: str = "infinity") -> str:
 
 def transfer(camera: Camera, size: int, distances: Sequence[float]) -> Tensor:
     """H (D, C, size, size) of a camera at object distances (D,) mm in its first field, on periodic pictures."""
-    return transfer_functions(camera.of_period(camera.kernels(distances), size), size)
+    return camera.transfer(camera.kernels(distances), size)
 
 
 def periodic(pictures: Pictures, size: int) -> Tensor:
@@ -103,11 +103,11 @@ def periodic(pictures: Pictures, size: int) -> Tensor:
         if min(sample.shape) < half:
             raise ValueError(f"a picture of {sample.shape[0]} × {sample.shape[1]} pixels, expected {half} at least")
         row, column = ((n - half) // 2 for n in sample.shape)
-        periods.append(mirrored(sample[row : row + half, column : column + half].astype(np.float64) / 255))
-    return torch.stack(periods)
+        periods.append(sample[row : row + half, column : column + half].astype(np.float64) / 255)
+    return mirrored(np.stack(periods))
 
 
-def mirrored(picture: np.ndarray) -> Tensor:
+def mirrored(picture: Tensor | np.ndarray) -> Tensor:
     """A picture (..., h, w) and its mirror images: one period (..., 2h, 2w) without a jump."""
     h, w = picture.shape[-2:]
     return extend(torch.as_tensor(picture), (2 * h, 2 * w), boundary="reflect")
@@ -173,7 +173,7 @@ def quality(
     """
     kernels = camera.kernels(depths) if kernels is None else kernels
     size, S = test.shape[-1], power_spectrum(train, window="none")
-    H, noise = transfer_functions(camera.of_period(kernels, size), size), camera.sensor.noise_deviation(S)
+    H, noise = camera.transfer(kernels, size), camera.sensor.noise_deviation(S)
     at_design = H[depths.index(design)] if design in depths else transfer(camera, size, [design])[0]
     gamma = best_gamma(H, S, noise, at_design)
     filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, noise)}

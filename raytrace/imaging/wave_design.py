@@ -23,6 +23,7 @@ from raytrace.imaging.closed_form import camera_error
 from raytrace.imaging.filters import DepthInvariantFilter, LinearFilter, TowardsMeasurement
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
+from raytrace.imaging.restoration import restore
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train, write_state
 from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import WaveCameraConfig, mirrored
@@ -213,11 +214,13 @@ class Design:
             random = draws(settings.seed, epoch, number, _SAMPLE)
             place = torch.tensor(int(random.integers(len(config.depths))))
             normal = random.uniform(*settings.noise) * random.standard_normal((len(config.wavelengths), n, n))
-            samples.append((mirrored(patch).to(self.spectrum), place, torch.as_tensor(normal).to(self.spectrum)))
-        picture, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
-        kernels = camera.kernels(config.depths, draw=draw)
-        image = camera.blurred(picture[:, None], kernels[depth]) + noise
-        estimate = camera.restore(image, kernels if isinstance(camera.filter, DepthInvariantFilter) else None)
+            samples.append((torch.as_tensor(patch), place, torch.as_tensor(normal)))
+        patches, depth, noise = (torch.stack(part) for part in zip(*samples, strict=True))
+        picture = mirrored(patches).to(self.spectrum)
+        # Periodic pictures are blurred by their transfer functions, from which the filter follows, too.
+        H = camera.transfer(camera.kernels(config.depths, draw=draw), n)
+        image = restore(picture[:, None], H[depth]) + noise.to(picture)
+        estimate = camera.restore(image, H if isinstance(camera.filter, DepthInvariantFilter) else None)
         return (estimate - picture[:, None]).square().mean((1, 2, 3)).sum() / settings.batch
 
 
