@@ -296,6 +296,17 @@ def test_a_run_begins_where_the_closed_form_ends(run, pictures):
 
 
 @pytest.mark.slow
+def test_a_lens_by_steps_of_second_order_stays_while_the_network_is_trained(run, pictures):
+    """The lens of every step of the training is the optimum of `--loss spectral` with the same optimizer."""
+    command = ("double_gauss", "--data", pictures, *PARAXIAL, "--optimizer", "lm", "-o", "one")
+    assert run(*command, "--loss", "spectral")[0] == 0
+    code, _, err = run(*command)
+    assert code == 0, err
+    sensors = [float(row["sensor"]) for row in rows("one/joint/log.csv")]
+    assert sensors == pytest.approx([read("one/spectral.json")["sensor_mm"]] * len(sensors), abs=1e-9)
+
+
+@pytest.mark.slow
 def test_spectral_at_infinity_is_valid_json(run, pictures):
     """A sensor kept 0.4 mm nearer than the focal plane: null in the file and in --json, "infinity" in words."""
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")

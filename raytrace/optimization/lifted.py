@@ -43,6 +43,7 @@ _FIRST = 0.2  # of the RMS spot: blur of the first undamped step
 _FACTOR = 4.0  # by which c changes at most from one step to the next
 _POWELL = 0.2  # least curvature of a pair, relative to that of B
 _RIDGE = 0.01  # of the blur by a variable alone: least blur of a step whose parts compensate each other
+_SMALLEST = 1e-6  # of the RMS spot: blur of a step, below which its change of the gradient is rounding
 _LEAST = 1e-8  # eigenvalue of B relative to the largest
 _AGAIN = 1e-3  # relative decrease of the loss by a descent after which another one without pairs begins
 _JUMP = 0.4  # of the RMS spot: blur of the displacement of a restart
@@ -129,6 +130,7 @@ class Lifted:
     def _curvature(self, blur: np.ndarray, spot: float) -> np.ndarray:
         """B (n, n) at the last place, of steps U p."""
         pairs = [(blur @ step, _solved(blur, change)) for step, change in self._pairs()]
+        pairs = [pair for pair in pairs if np.linalg.norm(pair[0]) > _SMALLEST * spot]
         if self.scale is None:
             steepness = float(np.linalg.norm(_solved(blur, self.places[-1].gradient)))
             self.scale = max(steepness / (_FIRST * spot), 1e-300) if spot > 0 else 1.0
@@ -216,7 +218,7 @@ def descend(
         )  # fmt: skip
         history, evaluations = (*history, *map(counted, descent.cycles)), evaluations + descent.evaluations
         x, end = descent.state.x, descent.state.cost
-        ended = descent.stopped in ("cycles", "seconds", "interrupted")
+        ended = descent.stopped in ("gradient", "cycles", "seconds", "interrupted")
         if ended or before - end <= _AGAIN * abs(end):
             return dataclasses.replace(descent, cycles=history, evaluations=evaluations)
         before = end
