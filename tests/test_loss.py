@@ -173,3 +173,15 @@ def test_what_goes_with_rows_alone_is_refused():
             rt.optimize(TRIPLET, **{"loss": mean_square, "vary": "sensor", **given})
     with pytest.raises(ValueError, match="did you mean points"):
         rt.optimize(TRIPLET, loss=mean_square, of="point", vary="sensor")
+
+
+def test_a_descent_begins_at_the_start_where_rays_fail_at_the_best_spots():
+    def needs_its_sensor(lens):
+        """A loss without a value where the sensor has moved by more than 0.1 mm."""
+        moved = lens.surfaces[-2].thickness - TRIPLET.surfaces[-2].thickness
+        return torch.where(moved.abs() < 0.1, 2.0 + moved + moved**2, torch.nan)
+
+    result = rt.optimize(TRIPLET, loss=needs_its_sensor, of="lens", vary="sensor", restarts=0)
+    assert np.isnan(result.loss.first)
+    assert result.loss.end < result.loss.start
+    assert "rays of it fail at the best spots" in str(result)

@@ -106,9 +106,9 @@ class Lifted:
         state = LiftedLoss(x, np.zeros(0), rows.lost, Sides.none(len(x)), rows.held, limits, loss=loss)
         if not derivatives:
             return state
-        blur, of_blur = self._metric(rows)
+        blur, spot = self._metric(rows)
         self.places.append(_Place(x, gradient, rows.held_slope))
-        values, axes = np.linalg.eigh(self._curvature(blur, of_blur))
+        values, axes = np.linalg.eigh(self._curvature(blur, spot))
         roots = np.sqrt(0.5 * np.maximum(values, _LEAST * values[-1]))
         return dataclasses.replace(
             state,

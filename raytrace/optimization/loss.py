@@ -62,7 +62,8 @@ class LossReport:
     """The way of a loss: at the start, where the rows end that were minimised first, at the end of every descent (from
     there, then from displaced lenses), and of the end by the rays of the descent and by denser ones.
 
-    refined: the number of descents with more rays, because a check had moved the loss by more than 2 %.
+    first: nan where rays of the loss fail there, and the descent begins at the start; has_first: whether rows were
+    minimised first; refined: descents with more rays, because a check had moved the loss by more than 2 %.
     """
 
     start: float
@@ -71,10 +72,13 @@ class LossReport:
     end: float
     checked: float
     refined: int = 0
+    has_first: bool = False
 
     def lines(self) -> list[str]:
         parts = [f"loss {self.start:.6g} at the start"]
-        parts += [] if np.isnan(self.first) else [f"{self.first:.6g} at the best spots"]
+        if self.has_first:
+            at_spots = f"{self.first:.6g}" if np.isfinite(self.first) else "rays of it fail"
+            parts.append(f"{at_spots} at the best spots")
         parts += [f"{end:.6g} after the descent" for end in self.ends[:1]]
         parts += [f"{end:.6g} from a displaced lens" for end in self.ends[1:]]
         lines = [", ".join(parts)]
@@ -129,11 +133,14 @@ class LossDescents:
         self.most, self.until = _UNLIMITED * (1 + restarts) if cycles is None else cycles, until
         before, x, at_first, taken = self.function(start)[0], start, np.nan, 0
         if first:
-            x, taken = self._at_best_rows(start)
-            at_first = self.function(x)[0]
+            at_rows, taken = self._at_best_rows(start)
+            at_first = self.function(at_rows)[0]
+            x = at_rows if np.isfinite(at_first) else start
         if not np.isfinite(self.function(x)[0]):
-            place = "the best spots: rays of the loss fail there" if first else "the start: nothing to follow"
-            raise NoProblem(f"the loss is {self.function(x)[0]:g} at {place}")
+            where = "the start and at the best spots" if first else "the start"
+            raise NoProblem(
+                f"the loss is {self.function(x)[0]:g} at {where}: rays of it fail, and nothing is to follow"
+            )
         best = self._descend(self.function, x, watch)
         random, ends = np.random.default_rng(0), [_loss(best)]
         for _ in range(restarts):
@@ -146,7 +153,7 @@ class LossDescents:
                 ends.append(_loss(descent))
                 best = descent if descent.state.is_better(best.state) else best
         best, checked, refined, evaluations = self._checked(best, watch)
-        report = LossReport(before, at_first, tuple(ends), _loss(best), checked, refined)
+        report = LossReport(before, at_first, tuple(ends), _loss(best), checked, refined, first)
         cycles, evaluations = taken + len(self.history), evaluations + self.function.evaluations
         return LossDescent(best.state.x, tuple(self.history), best.stopped, cycles, evaluations, report)
 
