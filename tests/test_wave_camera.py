@@ -9,6 +9,7 @@ import torch
 from scripts import script
 
 from raytrace.cli.wave_run import learn
+from raytrace.imaging.closed_form import camera_error
 from raytrace.imaging.pictures import dead_leaves, digest
 from raytrace.imaging.restoration import (
     depth_invariant_error,
@@ -241,6 +242,18 @@ def test_heights_err_within_their_tolerance():
     assert float(error.std()) == pytest.approx(2e-5 / math.sqrt(3), rel=0.2)
     with pytest.raises(ValueError, match="a basis of"):
         PhaseVariables(lens, basis=torch.zeros(3, 2, dtype=torch.float64))
+
+
+def test_errors_of_height_are_those_of_one_draw():
+    """By the kernels, and by an octant of the frequencies, to the precision of rings."""
+    lens = baseline("fresnel", aim(), pitch=0.05)[0]
+    camera = SMALL.camera(PhaseVariables(lens, tolerance=1e-4))
+    made = SMALL.camera(camera.elements(draw=torch.Generator().manual_seed(1)))
+    wanted = camera_error(made, S, SMALL.depths)
+    for tolerance in (1e-12, 1e-5):
+        error = camera_error(camera, S, SMALL.depths, draw=torch.Generator().manual_seed(1))
+        torch.testing.assert_close(error, wanted, rtol=tolerance, atol=0)
+        camera.plan(SMALL.depths)
 
 
 def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):

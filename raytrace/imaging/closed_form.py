@@ -23,7 +23,7 @@ from raytrace.imaging.restoration import (
     kernel_error,
     power_spectrum,
 )
-from raytrace.imaging.variables import PhaseVariables, Variables
+from raytrace.imaging.variables import Variables
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.sampling import gauss_rings
 from raytrace.optimization.least_squares import TensorDescent, minimise_tensors
@@ -69,11 +69,15 @@ def camera_error(
     """
     spectrum = spectrum.to(camera.fields.device)
     sigma = camera.sensor.noise_deviation(spectrum)
-    if isinstance(camera.variables, PhaseVariables) and camera.normalise == "haze":
-        error = octant_error(camera.element_kernels(distances, draw=draw), spectrum, sigma)
+    haze = camera.normalise == "haze"
+    if haze:  # of elements alone, whose kernels are alike at all places
+        of_elements = camera.element_kernels(distances, draw=draw)
+        error = octant_error(of_elements, spectrum, sigma)
         if error is not None:
             return error
-    kernels, haze = camera.kernels_over_field(distances, draw=draw), camera.normalise == "haze"
+        kernels = of_elements.paired(camera.fields)[:, None]
+    else:
+        kernels = camera.kernels_over_field(distances, draw=draw)
     if spectrum.dim() == 4:
         return joint_kernel_error(kernels, spectrum, sigma, haze=haze).mean()
     return kernel_error(kernels, spectrum.to(kernels.dtype), sigma, haze=haze).mean()

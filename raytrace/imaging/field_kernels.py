@@ -55,7 +55,7 @@ from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
-#: Kernels of sum 1; or of the share of all light, of which the part beyond the window is lost, or returns as even haze.
+#: Kernels have the sum 1 ("window"), or the share of all light: the rest is lost ("energy"), or an even haze ("haze").
 Normalisation: TypeAlias = Literal["window", "energy", "haze"]
 #: A PSF model with its numbers.
 Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
