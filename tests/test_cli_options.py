@@ -18,6 +18,7 @@ import numpy as np
 import pandas
 import pytest
 import torch
+from layers import parsed
 
 import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
@@ -483,7 +484,7 @@ def test_messages_name_options_by_a_function():
         f"{path.relative_to(package)}:{line}: `{word}`"
         for path in sorted(package.rglob("*.py"))
         if not str(path.relative_to(package)).startswith(others)
-        for text, line in sentences(ast.parse(path.read_text("utf-8")))
+        for text, line in sentences(parsed(path))
         for word in re.findall(r"`(\w+)(?:=[^`]*)?`", text)
         if word in names
     ]
