@@ -257,6 +257,7 @@ def test_diffraction_meets_rays_where_the_blur_is_large():
     assert (wave.tangential - rays.tangential).abs().max() < 0.02
 
 
+@pytest.mark.slow
 def test_through_focus_is_the_mtf_at_each_sensor():
     """About the sensor of the file, where this lens is in focus."""
     lens = perfect()
@@ -415,6 +416,7 @@ def test_relative_illumination_counts_vignetting():
 # derivatives and doors
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences():
     """Of the sensor distance, at a place where no ray of the double Gauss is lost."""
 

@@ -99,6 +99,7 @@ def test_targets_compare_the_quickest_that_come_as_close():
     assert words[5:] == ["50% of 2", "50% of 2"]
 
 
+@pytest.mark.slow
 def test_estimates_are_compared_with_true_errors(few):
     case = published_cases("hubble", read_lens("hubble"))[0]
     truth = truth_of(case)

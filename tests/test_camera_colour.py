@@ -192,6 +192,7 @@ def test_gradients_of_the_whole_camera_are_those_of_differences(triplet, model):
     assert slopes.tolist() == pytest.approx(differences, rel=1e-3, abs=2e-4 * float(slopes.abs().max()))
 
 
+@pytest.mark.slow
 def test_vignetting_factors_move_with_the_field_of_the_middle():
     """Tilting a surface of a Tessar at 2 m moves the field at the middle of the sensor from the listed one, 0."""
     one = made(rt.read_lens("tessar").at(object_distance=2000.0), "tilt_x:3", object_distances=(1.9e3, 2.1e3), tol=1e-3)

@@ -18,6 +18,7 @@ import numpy as np
 import pandas
 import pytest
 import torch
+from layers import parsed
 
 import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
@@ -469,8 +470,9 @@ def test_an_option_is_named_as_its_reader_writes_it():
 
 def sentences(tree):
     """Texts of a module, docstrings aside, with their lines."""
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = [*ast.walk(tree)]
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
             yield node.value, node.lineno
 
@@ -483,7 +485,7 @@ def test_messages_name_options_by_a_function():
         f"{path.relative_to(package)}:{line}: `{word}`"
         for path in sorted(package.rglob("*.py"))
         if not str(path.relative_to(package)).startswith(others)
-        for text, line in sentences(ast.parse(path.read_text("utf-8")))
+        for text, line in sentences(parsed(path))
         for word in re.findall(r"`(\w+)(?:=[^`]*)?`", text)
         if word in names
     ]

@@ -184,6 +184,7 @@ def test_distances_even_in_their_reciprocal(lens):
     assert 10e3 <= float(drawn.min()) <= float(drawn.max()) <= 50e3
 
 
+@pytest.mark.slow
 def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     """Of 8 steps the first has the whole rate, the fifth half of it; a run that goes on ends as one that never
     stopped, and a constant rate is what it was."""

@@ -236,6 +236,7 @@ def test_the_learned_lens_is_a_file_that_traces(run, command, pictures):
     assert float(read_lens("run/lens.zmx").surfaces[-2].thickness) == read("run/outcome.json")["sensor_mm"]
 
 
+@pytest.mark.slow
 def test_wavelengths_of_the_file_are_an_option(run, pictures):
     options = ("--data", pictures, *SMALL, "--model", "paraxial", "--loss", "spectral", "--json")
     lens = read_lens(raytrace.files.shipped("lenses") / "cooke_triplet.zmx")

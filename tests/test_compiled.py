@@ -157,6 +157,7 @@ def test_a_gap_that_rays_along_the_axis_cross_has_no_derivative():
         assert float(gradient) == 0.0
 
 
+@pytest.mark.slow
 def test_gradients_of_gradients_pass_through_the_eager_trace():
     system = double_gauss()
     rays = Rays(*(x[..., :5] for x in (some_rays().position, some_rays().direction, some_rays().valid)))

@@ -299,6 +299,7 @@ def spectrum(pictures):
     return patch_spectrum(pictures, SMALL.patch + SMALL.size - 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [pytest.param("paraxial", marks=pytest.mark.slow), "gaussian"])
 def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
     settings = dataclasses.replace(SMALL, model=model)

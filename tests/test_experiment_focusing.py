@@ -62,6 +62,7 @@ def test_learns_a_lens_from_a_flat_plate(collimator):
     assert [frame.step for frame in found.frames] == [0, found.steps, -1]
 
 
+@pytest.mark.slow
 def test_flat_pixels_lose_what_they_bend():
     """sinc² of the waves across a pixel, a/λz · r: mean over the disc ∫ sinc², 0.878 of the peak, field by field."""
     setting = Setting()

@@ -12,8 +12,9 @@ EMPTY = {"one", "found", "at", "own", "of", "there", "such", "named"}
 def bound_names(tree):
     """Names that a module binds, with their lines: variables, loop variables and arguments, but for options, whose
     name is read with their value, as in `of="points"`."""
-    options = {id(option) for node in ast.walk(tree) if isinstance(node, ast.arguments) for option in node.kwonlyargs}
-    for node in ast.walk(tree):
+    nodes = [*ast.walk(tree)]
+    options = {id(option) for node in nodes if isinstance(node, ast.arguments) for option in node.kwonlyargs}
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id, node.lineno
         elif isinstance(node, ast.arg) and id(node) not in options:

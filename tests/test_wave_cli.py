@@ -237,6 +237,7 @@ def test_exact_spheres_and_paraboloids_differ(run):
     assert 1e-4 < abs(peaks[0] / peaks[1] - 1) < 0.05
 
 
+@pytest.mark.slow
 def test_text_and_the_other_figures(run, tmp_path):
     names = {"--heights": "h.png", "--encircled": "e.svg"}
     words = [word for pair in names.items() for word in pair]

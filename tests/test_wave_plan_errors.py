@@ -180,6 +180,7 @@ def test_a_mixed_scene_does_not_depend_on_its_band():
     assert relative(psf(seen, plan=chosen).kernel, psf(seen, plan=wider).kernel) < chosen.error
 
 
+@pytest.mark.slow
 def test_heights_of_mixed_scenes_have_derivatives():
     """Against differences of the peak pixel by one ring and by the strength of the plate."""
     lens, plate = baseline("cubic", aim(radius=0.1))
