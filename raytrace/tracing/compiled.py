@@ -100,6 +100,11 @@ def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
     return _available(build=rays.direction[0].numel() * surfaces >= WORTH_COMPILING)
 
 
+def is_ready(surfaces: Sequence[Surface]) -> bool:
+    """Whether the compiled trace is built and supports all of these surfaces."""
+    return engine() != "eager" and _available(build=False) and all(map(is_expressible, surfaces))
+
+
 def _available(*, build: bool) -> bool:
     if _refused or not (build or is_built()):
         return False

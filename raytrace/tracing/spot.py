@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import RAY_BYTES, afford, afford_rays, piece
-from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt, value
+from raytrace.maths.numerics import dot_2, is_any, safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, axis, masked
 from raytrace.system.lens import Lens, field_points, one_lens
 from raytrace.system.rays import Rays
+from raytrace.tracing.compiled import is_ready
 from raytrace.tracing.launch import launch
 from raytrace.tracing.ray_failures import STATUS, ray_status
 from raytrace.tracing.trace import is_bent, trace_lens, without_apertures
@@ -68,33 +69,40 @@ def spot_of_points(
     spot of one ray has radius 0 and gradient 0.
     """
     shape = points.shape[1:]
-    weights = torch.ones_like(points[0]) if weights is None else weights.expand(shape)
+    weights = points.new_ones(()) if weights is None else weights
+    weights = weights.expand(shape[-1:] if weights.dim() < 2 else shape)  # of all spots once, if they are alike
     size = max(1, _PIECE // max(1, shape[1:].numel()))
     if len(shape) == 1 or shape[0] <= size:
         figures = _statistics(points, valid, weights, about)
     else:
         around = itertools.repeat(None) if about is None else about.expand(2, *shape[:-1]).split(size, 1)
-        parts = zip(points.split(size, 1), valid.expand(shape).split(size), weights.split(size), around, strict=False)
+        shares = itertools.repeat(weights) if weights.dim() == 1 else weights.split(size)
+        parts = zip(points.split(size, 1), valid.expand(shape).split(size), shares, around, strict=False)
         each = zip(*(_statistics(*part) for part in parts), strict=True)
         figures = tuple(torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each))
     centroid, mean_square, rms, geometric = where_lit(*figures, empty=empty)
-    return Spot(centroid, mean_square, rms, geometric, points, valid, valid.sum(-1))
+    return Spot(centroid, mean_square, rms, geometric, points, valid, valid.sum(-1, dtype=torch.int32).to(torch.int64))
 
 
 def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | None) -> tuple[Tensor, ...]:
     """Whether light arrives (...), its centroid (2, ...), the mean square, RMS and geometric radius (...)."""
-    weights = torch.where(valid, weights, 0.0)
+    lost = is_any(~valid)
+
+    def of_valid(numbers: Tensor) -> Tensor:
+        return torch.where(valid, numbers, 0.0) if lost else numbers
+
+    weights = of_valid(weights)
     total = weights.sum(-1, keepdim=True)
     share = weights * safe_divide(torch.ones_like(total), total)
-    reference = torch.zeros_like(total)
-    if points.shape[-1]:
+    reference = points[..., :1] if points.shape[-1] else torch.zeros_like(total)
+    if lost:
         first = valid.to(torch.uint8).argmax(-1, keepdim=True)
         reference = points.gather(-1, first.expand(2, *first.shape))
         reference = torch.where(valid.any(-1, keepdim=True), reference, 0.0)
-    offset = torch.where(valid, points - reference, 0.0)
+    offset = of_valid(points - reference)
     mean = (share * offset).sum(-1, keepdim=True)
     centre = mean if about is None else about[..., None] - reference
-    centred = torch.where(valid, offset - centre, 0.0)
+    centred = of_valid(offset - centre)
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)
     scaled = centred / scale
@@ -103,7 +111,8 @@ def _statistics(points: Tensor, valid: Tensor, weights: Tensor, about: Tensor | 
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
     rms, geometric = (scale * safe_sqrt(t) for t in (scaled_mean, largest))
-    return total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric
+    lit = (total[..., 0] != 0).expand(rms.shape)
+    return lit, (reference + mean)[..., 0], mean_square, rms, geometric
 
 
 def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
@@ -126,7 +135,8 @@ def _power_of_two(vectors: Tensor) -> Tensor:
     """The power of two above the largest entry of (2, ..., P) over the first and last axes, (..., 1); 1 if none."""
     if not vectors.shape[-1]:
         return vectors.new_ones((*vectors.shape[1:-1], 1))
-    largest = vectors.detach().abs().amax(0).amax(-1, keepdim=True)
+    vectors = vectors.detach()
+    largest = torch.maximum(vectors.amax(-1, keepdim=True), -vectors.amin(-1, keepdim=True)).amax(0)
     usable = (largest > 0) & torch.isfinite(largest)
     return torch.ldexp(torch.ones_like(largest), torch.frexp(torch.where(usable, largest, 0.5)).exponent)
 
@@ -144,6 +154,7 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
 
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status
+_COMPILED_BYTES = 100  # as RAY_BYTES, of the compiled trace: 72 measured
 
 #: Fields (2, F) and lenses of one trace.
 Chunk = tuple[Tensor, Lens]
@@ -205,9 +216,10 @@ def arrivals(
     count = f"{L * F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points{f' × {L} lenses' * (L > 1)})"
     helps = "ask for fewer, or by {rays}, which keeps none"
     afford(L * (RAY_BYTES * W * P + _KEPT_BYTES * F * W * P), count, helps=helps)
-    size = piece(RAY_BYTES * F * W * P)  # lenses at once; a lens whose fields exceed a chunk is split by fields
+    trace = W * P * (_COMPILED_BYTES if is_ready(lens.surfaces[1:]) else RAY_BYTES)  # bytes for each field of a lens
+    size = piece(F * trace)  # lenses at once; a lens whose fields exceed a chunk is split by fields
     lenses = [lens] if size >= L else [one_lens(lens, slice(k, k + size)) for k in range(0, L, size)]
-    some_fields = fields.split(piece(min(L, size) * RAY_BYTES * W * P), 1)
+    some_fields = fields.split(piece(min(L, size) * trace), 1)
     each = []  # of every chunk, rays (3, F, W, P) on the sensor, whether they reach it, and their status if one fails
     for some, part in progress([(some, part) for some in some_fields for part in lenses]):
         launched = launch(part, pupil, fields=some, ray_aiming=ray_aiming)
