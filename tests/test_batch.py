@@ -39,17 +39,16 @@ def perturbed(name, count=3, ray_aiming="off", posed=True):
     return lens.replace(3, after=rt.system.Pose(tilt_x=-0.01 * error, tilts_first=True))
 
 
-def psf_of(model):
+def psf_of(model, pixel=0.004):
     """Kernels (L, F, 21, 21), (F, 21, 21) of a single lens."""
 
     def kernels(lens):
-        found = rt.psf(lens, model, pixel=0.004)
+        found = rt.psf(lens, model, pixel=pixel)
         return found.kernel if lens.count else found.kernel[0]
 
     return kernels
 
 
-#: PSF models whose kernels of one call do not share a decision: the number of cells of DRT is that of the widest.
 MODELS = {
     "paraxial": rt.psf_models.Paraxial(order=0),
     "fourier": rt.psf_models.Fourier(order=1),
@@ -68,6 +67,7 @@ VERBS = {
     "strehl": lambda lens: rt.wavefront(lens, size=31).strehl,
     "geometric mtf": lambda lens: rt.mtf(lens, [30.0], geometric=True).tangential,
     **{f"psf {name}": psf_of(model) for name, model in MODELS.items()},
+    "psf drt": psf_of(rt.psf_models.DRT(order=1), pixel=0.03),
     "trace": lambda lens: rt.trace(lens).position.movedim(0, -1),
     "hexapolar": lambda lens: rt.spot(lens, sampling="hexapolar", rings=4).mean_square_radius,
 }

@@ -285,10 +285,28 @@ def test_statistics_of_many_spots_are_those_of_each():
     torch.testing.assert_close(found.rms_radius[k, j], square.sqrt(), rtol=1e-13, atol=0)
 
 
-def test_statistics_in_several_pieces_have_their_derivatives(monkeypatch):
+@pytest.mark.parametrize("weighting", ["common", "each"])
+def test_spots_that_lose_nothing_are_those_beside_a_lost_ray(weighting):
+    """A lost ray changes the way to the numbers, not the numbers; the weights are common to all spots, or of each."""
+    generator = torch.Generator().manual_seed(4)
+    points = 1e3 + torch.randn(2, 5, 3, 40, generator=generator, dtype=torch.float64)
+    weights = torch.rand(5, 3, 40, generator=generator, dtype=torch.float64)
+    weights = weights[0, 0] if weighting == "common" else weights
+    everywhere = torch.ones(5, 3, 40, dtype=torch.bool)
+    all_arrive = spot_of_points(points, everywhere, weights)
+    lost = torch.full((2, 5, 3, 1), torch.nan, dtype=torch.float64)
+    more = torch.nn.functional.pad(weights, (1, 0), value=0.3)
+    one_lost = spot_of_points(torch.cat([lost, points], -1), torch.nn.functional.pad(everywhere, (1, 0)), more)
+    for name in ("centroid", "mean_square_radius", "rms_radius", "geometric_radius", "rays"):
+        torch.testing.assert_close(getattr(all_arrive, name), getattr(one_lost, name), rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("is_any_lost", [True, False])
+def test_statistics_in_several_pieces_have_their_derivatives(monkeypatch, is_any_lost):
     monkeypatch.setattr("raytrace.tracing.spot._PIECE", 5)
     points = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(6), dtype=torch.float64, requires_grad=True)
     valid = torch.tensor([[True] * 5, [False, True, True, False, True], [True, False] * 2 + [True]])
+    valid = valid if is_any_lost else torch.ones_like(valid)
 
     def figures(points):
         spots = spot_of_points(points, valid)

@@ -88,8 +88,8 @@ class Model:
     is_rung: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
-    in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them:
-        cameras, whose kernels do not depend on the others of a batch, call it for each.
+    in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them: it is
+        called for each lens and object distance, and by cameras for each kernel, which so depend on no others.
 
     The error of an order is extrapolated from its changes (`by_tolerance`), unless `proof` is set:
     by_width: whether the error is that of σ, instead of the kernel.
@@ -225,8 +225,9 @@ def psf(
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned.
     normalise: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
     Of a batch of L lenses, at one object distance, the first axis of the result counts the lenses instead. Without an
-    order, that of each object distance or lens is chosen alone, and so is the model of "auto": its PSFs are those of a
-    call for it alone. `model` and `order` of the result are then the finest of them.
+    order, that of each object distance or lens is chosen alone, and so is the model of "auto", and at any order the
+    cells of "drt": its PSFs are those of a call for it alone. `model` and `order` of the result are then the finest of
+    them.
     execution: memory, processes and progress, see `Execution`.
 
     Raises ValueError for invalid arguments, EmptyPsf if no ray at all reaches the sensor. Warns NotConverged and,
@@ -329,10 +330,11 @@ def psf(
             centre = centre[..., None].expand(*centre.shape, len(wavelengths))
         return drive(batch, dataclasses.replace(base, centre=centre), None if per_wavelength else shares)
 
-    # A choice by an estimate is made for each object distance, or lens, alone: no PSF depends on its neighbours.
-    # A fixed amount of work is done together, for finite distances and infinite ones apart.
+    # A choice is made for each object distance, or lens, alone: no PSF depends on its neighbours. A fixed amount of
+    # work is done together, for finite distances and infinite ones apart.
     infinite, numbers = torch.isinf(distances), torch.arange(len(distances), device=distances.device)
-    is_fixed = order is not None or points is not None or (rays is not None and MODELS[name].plain is not None)
+    is_fixed = points is not None or (rays is not None and MODELS[name].plain is not None)
+    is_fixed = is_fixed or (order is not None and not MODELS[name].in_common)
     groups = [numbers[~infinite], numbers[infinite]] if is_fixed else list(numbers.split(1))
     groups = [group for group in groups if len(group)]
     with within(execution.max_bytes) if execution.max_bytes is not None else contextlib.nullcontext():

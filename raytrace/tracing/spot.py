@@ -69,13 +69,14 @@ def spot_of_points(
     spot of one ray has radius 0 and gradient 0.
     """
     shape = points.shape[1:]
-    weights = points.new_ones(shape[-1]) if weights is None else weights
+    weights = points.new_ones(()) if weights is None else weights
+    weights = weights.expand(shape[-1:] if weights.dim() < 2 else shape)  # of all spots once, if they are alike
     size = max(1, _PIECE // max(1, shape[1:].numel()))
     if len(shape) == 1 or shape[0] <= size:
         figures = _statistics(points, valid, weights, about)
     else:
         around = itertools.repeat(None) if about is None else about.expand(2, *shape[:-1]).split(size, 1)
-        shares = itertools.repeat(weights) if weights.dim() == 1 else weights.expand(shape).split(size)
+        shares = itertools.repeat(weights) if weights.dim() == 1 else weights.split(size)
         parts = zip(points.split(size, 1), valid.expand(shape).split(size), shares, around, strict=False)
         each = zip(*(_statistics(*part) for part in parts), strict=True)
         figures = tuple(torch.cat(pieces, int(k == 1)) for k, pieces in enumerate(each))
