@@ -38,12 +38,9 @@ def _one_parser():
 @pytest.fixture(scope="session", autouse=True)
 def _imports_are_no_garbage():
     """The collector leaves alone what imports and the collection of tests have made, instead of looking it through."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)  # trees and tensors of a test are many: looked through less often than by default
     gc.enable()
-    yield
-    gc.unfreeze()
 
 
 @pytest.fixture

@@ -2,9 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from problems import double_gauss, lens, scalar, surface, vector
+from problems import double_gauss, lens, number, scalar, surface, vector
 
 from raytrace.psf_models.drt import trace_clearances
 from raytrace.system.surface import Aperture
@@ -51,6 +52,18 @@ def area(result: Scene, count: int = 256) -> torch.Tensor:
 )
 def test_area_of_the_clear_pupil(apertures, expected, allowed):
     assert float(area(window(*apertures))) == pytest.approx(expected, abs=allowed)
+
+
+def test_a_vane_takes_its_share_of_the_aberrations():
+    """ρ⁴ over the disc without a strip |x| < b, integrated over the width of the strip: edges are steep beside it."""
+    half = 0.08
+    points, weights = arms_of(window(Aperture("rectangular", (RADIUS * half, 1.1 * RADIUS), True)), 48).rule(12)
+    nodes, shares = (number(part) for part in np.polynomial.legendre.leggauss(12))
+    x = 0.5 * half * (nodes + 1)
+    h = torch.sqrt(1 - x**2)
+    strip = 4 / math.pi * (0.5 * half * shares * (x**4 * h + 2 / 3 * x**2 * h**3 + h**5 / 5)).sum()
+    found = (weights * points.square().sum(0) ** 2).sum()
+    assert found.item() == pytest.approx(1 / 3 - strip.item(), rel=1e-6)
 
 
 def test_the_area_moves_with_the_corners_to_second_order():

@@ -45,6 +45,7 @@ _DIFFERENCE = 1e-4  # of the radius of the pupil: step of the differences that a
 _SETTLED, _ROUNDED = 1e-2, 1e-9  # of the radius: the last step that was not yet taken; of clearances
 _TOGETHER = 32  # lenses whose clear pupils are searched at once
 _NODES, _DENSER = 8, 1.25  # of a span between kinks; more of them than arms of equal steps
+_DENSER_AT_KINKS = 0.7  # β: halfway between kinks angles are 1 + β/2 as far apart, at them 1 - β
 
 
 @value
@@ -301,7 +302,30 @@ def _angles(kinks: Tensor, count: int, around: float) -> tuple[Tensor, Tensor]:
         here = (known == number)[..., None]
         angles = torch.where(here, torch.cat([angle, angle[..., -1:].expand(rest)], -1), angles)
         shares = torch.where(here, torch.cat([share, share.new_zeros(rest)], -1), shares)
-    return angles, shares
+    return _denser_at_kinks(angles, shares, kinks, known, around) if most else (angles, shares)
+
+
+def _denser_at_kinks(
+    angles: Tensor, shares: Tensor, kinks: Tensor, known: Tensor, around: float
+) -> tuple[Tensor, Tensor]:
+    """Angles and shares (D, F, W, A) moved towards the kinks (D, F, W, K), sorted, on either side of each.
+
+    The edge of a vane of half width b is at b/sin θ, steep beside the kink at sin θ = b. Between two kinks a and a + Λ
+
+        θ = a + Λ g(s),   s = (θ₀ - a)/Λ,   g = (1 - β) s + β s² (3 - 2 s)
+    """
+    is_bent = (known > 0)[..., None]
+    first, last = kinks[..., :1], kinks.gather(-1, (known - 1).clamp_min(0)[..., None])
+    first, last = (torch.where(is_bent, end, 0.0) for end in (first, last))
+    # The kinks of the other half, or of the next turn, are those of this one.
+    before, after = (last - around, first + around) if around > 4 else (-first, 2 * around - last)
+    ends = torch.cat([before, torch.where(torch.isfinite(kinks), kinks, after), after], -1)
+    place = torch.searchsorted(kinks.detach().contiguous(), angles.detach().contiguous())
+    low, high = ends.gather(-1, place), ends.gather(-1, place + 1)
+    s = (angles - low) / (high - low)
+    moved = low + (high - low) * s * (1 - _DENSER_AT_KINKS * (1 - s) * (1 - 2 * s))
+    parts = shares * (1 - _DENSER_AT_KINKS * (1 - 6 * s * (1 - s)))
+    return torch.where(is_bent, moved, angles), torch.where(is_bent, parts, shares)
 
 
 def _no_kinks(edges: Edges, count: int) -> Kinks:
