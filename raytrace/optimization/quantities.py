@@ -1,8 +1,7 @@
 """Quantities of a lens that a loss is a function of: landing points, kernels, transfer functions.
 
-    rt.optimize(lens, loss=lambda otf: (1 - otf.abs()).mean(), of="otf", vary="curvature thickness", hold="efl=100")
-
-A quantity is sampled by as many rays as its settings say, so that the loss is smooth in the numbers of the lens, and
+A loss of `rt.optimize` takes one of them, as of="otf", or a function of the lens computes it, as Otf(rings=4)(lens). A
+quantity is sampled by as many rays as its settings say, so that the loss is smooth in the numbers of the lens, and
 `denser` has more of them: a lens is never judged by the rays that it was optimised on alone.
 """
 
