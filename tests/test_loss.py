@@ -184,4 +184,4 @@ def test_a_descent_begins_at_the_start_where_rays_fail_at_the_best_spots():
     result = rt.optimize(TRIPLET, loss=needs_its_sensor, of="lens", vary="sensor", restarts=0)
     assert np.isnan(result.loss.first)
     assert result.loss.end < result.loss.start
-    assert "rays of it fail at the best spots" in str(result)
+    assert "rays of the loss fail at the best spots" in str(result)

@@ -74,17 +74,21 @@ class LossReport:
     refined: int = 0
     has_first: bool = False
 
+    def stages(self) -> list[tuple[str, float]]:
+        """The loss by stage of the way, in words; without those that have none."""
+        listed = [("at the start", self.start), ("at the best spots", self.first)]
+        listed += [("after the descent", end) for end in self.ends[:1]]
+        listed += [("from a displaced lens", end) for end in self.ends[1:]]
+        listed += [("with more rays", self.end)] if self.refined else []
+        return [stage for stage in [*listed, ("by denser rays", self.checked)] if np.isfinite(stage[1])]
+
     def lines(self) -> list[str]:
-        parts = [f"loss {self.start:.6g} at the start"]
-        if self.has_first:
-            at_spots = f"{self.first:.6g}" if np.isfinite(self.first) else "rays of it fail"
-            parts.append(f"{at_spots} at the best spots")
-        parts += [f"{end:.6g} after the descent" for end in self.ends[:1]]
-        parts += [f"{end:.6g} from a displaced lens" for end in self.ends[1:]]
-        lines = [", ".join(parts)]
-        if not np.isnan(self.checked):
-            more = f"; the descent went on with more rays {self.refined} times" if self.refined else ""
-            lines.append(f"by denser rays {self.checked:.6g}, by those of the descent {self.end:.6g}{more}")
+        """The way in a line, and what should be known of it."""
+        lines = ["loss " + ", ".join(f"{number:.6g} {name}" for name, number in self.stages())]
+        if self.has_first and not np.isfinite(self.first):
+            lines.append("rays of the loss fail at the best spots: the descent began at the start")
+        if np.isfinite(self.checked) and abs(self.checked - self.end) > _MOVED * abs(self.checked):
+            lines.append("denser rays move the loss by more than 2 %: allow more cycles, or take a finer quantity")
         return lines
 
 

@@ -105,6 +105,11 @@ class Optimized(Result):
         return optimize_report(self)
 
     @property
+    def measure(self) -> str:
+        """What was minimised, in a word."""
+        return "merit" if self.loss is None else "loss"
+
+    @property
     def rows(self) -> tuple[int, ...]:
         """Rows that have a value, counted from 1."""
         return tuple(i for i, row in enumerate(self.merit, 1) if row.operand in OPERANDS)
@@ -175,7 +180,7 @@ class Optimized(Result):
         ratio = self.merit_before / self.merit_after if self.merit_after > 0 else np.inf
         head = [
             self.lens.name,
-            f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
+            f"  {self.measure} {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             *([f"  {self.as_built}"] if self.as_built else []),
@@ -216,7 +221,9 @@ class Optimized(Result):
         return Table({Column("configuration"): numbers, **lengths, Column("left", "%", ".1f"): left}, [""])
 
     def _largest_rows(self) -> Table:
-        """The rows of the largest contributions."""
+        """The rows of the largest contributions; none of a loss."""
+        if not self.merit:
+            return Table({}, [])
         left = sorted(self.rows, key=lambda i: -float(self.contributions[i - 1]))
         left = [i for i in left if self.merit[i - 1].weight != 0]
         shown = [self.merit[i - 1] for i in left[:_SHOWN]]

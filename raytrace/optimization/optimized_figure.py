@@ -11,6 +11,7 @@ from raytrace.analysis.panels import first_order_text
 from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.maths.numerics import detached
 from raytrace.optimization.checkpoint import STOPPED
+from raytrace.optimization.loss import LossReport
 from raytrace.optimization.optimized import Optimized
 from raytrace.plotting import style
 from raytrace.system.lens import Lens, field_label
@@ -42,12 +43,17 @@ def optimize_report(result: Optimized) -> "Figure":
             (row[0], before, "Before", result.merit_before),
             (row[1], after, "After", result.merit_after),
         ):
-            _draw_lens(axes, lens, f"{when}, {label}" if label else f"{when}: merit {style.number_text(merit)}")
+            _draw_lens(
+                axes, lens, f"{when}, {label}" if label else f"{when}: {result.measure} {style.number_text(merit)}"
+            )
         on_one_scale(row)
     _draw_spots(middle, drawn)
     left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
     _draw_history(left, result)
-    _draw_contributions(right, result)
+    if result.loss is None:
+        _draw_contributions(right, result)
+    else:
+        _draw_way(right, result.loss)
     if conditions:
         _draw_conditions(last[0].add_subplot(), result)
     return figure
@@ -128,8 +134,8 @@ def _draw_history(axes: "Axes", result: Optimized) -> None:
     axes.locator_params(axis="x", integer=True)
     axis = "step of the choice of glasses, then cycle" if of_glasses else "cycle"
     axes.set_xlabel(f"{axis} ({result.evaluations} evaluations, {result.seconds:.2g} s)")
-    axes.set_ylabel("merit")
-    axes.set_title("Merit function", fontweight="bold")
+    axes.set_ylabel(result.measure)
+    axes.set_title("Merit function" if result.loss is None else "Loss", fontweight="bold")
     axes.annotate(
         STOPPED[result.stopped], (0.98, 0.94), xycoords="axes fraction", ha="right", fontsize=7.5, color=style.GREY
     )
@@ -145,6 +151,23 @@ def _scale_merit(axes: "Axes", merit: np.ndarray) -> None:
         axes.set_ylim(0.9 * least, 1.1 * most or 1.0)
     else:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=True)
+
+
+def _draw_way(axes: "Axes", way: LossReport) -> None:
+    """The loss at the start, at the best spots, at the end of each descent, and by denser rays."""
+    bars = way.stages()
+    places = np.arange(len(bars))
+    values = [number for _, number in bars]
+    axes.barh(places, values, 0.6, color=[_BEFORE, *[_AFTER] * (len(bars) - 1)])
+    axes.set_yticks(places, [name for name, _ in bars])
+    axes.invert_yaxis()
+    for place, number in zip(places, values, strict=True):
+        axes.annotate(
+            style.number_text(number), (number, place), (3, 0), textcoords="offset points", va="center", fontsize=7.5
+        )
+    axes.margins(x=0.15)
+    axes.set_xlabel("loss")
+    axes.set_title("The way of the loss", fontweight="bold")
 
 
 def _draw_contributions(axes: "Axes", result: Optimized) -> None:
