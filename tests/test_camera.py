@@ -1,5 +1,6 @@
 """Camera and co-design: image formation, what learns and what does not, and runs from start to end."""
 
+import copy
 import dataclasses
 import itertools
 import json
@@ -526,3 +527,24 @@ def test_a_kernel_does_not_depend_on_its_batch(model):
     torch.testing.assert_close(other[1], kernels[1], rtol=0, atol=1e-11)
     torch.testing.assert_close(alone[0], kernels[1], rtol=0, atol=1e-11)
     torch.testing.assert_close(own.kernels(distances, 1).detach(), kernels, rtol=0, atol=1e-11)
+
+
+def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():
+    own = Camera(
+        Variables(read_lens("cooke_triplet"), "sensor"),
+        torch.nn.Identity(),
+        sensor=Sensor((24, 16), (240, 160)),
+    )
+    with pytest.raises(ValueError, match="give mm"):
+        own(torch.rand(1, 1, 32, 32), 25.0)
+    with pytest.raises(ValueError, match="beyond the edges of the sensor of 24 x 16 mm"):
+        own(torch.rand(1, 1, 32, 32), 25e3, points=torch.tensor([[12.1], [0.0]]))
+
+
+def test_a_lens_that_follows_parameters_is_copied_with_its_graph():
+    variables = Variables(read_lens("cooke_triplet"), "sensor")
+    lens = copy.deepcopy(variables())
+    (gradient,) = torch.autograd.grad(lens.surfaces[-2].thickness, list(variables.parameters()))
+    assert float(gradient) == 1.0
+    fixed = copy.deepcopy(variables.lens)
+    assert fixed.surfaces[1].curvature is not variables.lens.surfaces[1].curvature

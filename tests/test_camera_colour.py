@@ -212,6 +212,7 @@ def test_vignetting_factors_move_with_the_field_of_the_middle():
 def test_a_place_without_a_chief_ray_has_a_kernel_of_0(triplet, model):
     """It was a point, as of a perfect lens, and the place nan was the axis."""
     one, points = made(triplet, model=model), torch.tensor([[0.0, 0.0], [5.0, 300.0]], dtype=torch.float64)
+    one.sensor = dataclasses.replace(one.sensor, size=(24.0, 640.0), pixels=(120, 3200))
     with pytest.warns(DarkPlaces, match=r"1 of 2 places .* \(0, 300\) mm"):
         kernels = one.kernels(points.new_tensor([1e4, 2e4]), points=points)
     torch.testing.assert_close(kernels.sum((-2, -1)).detach(), points.new_tensor([[1.0] * 3, [0.0] * 3]))

@@ -33,7 +33,7 @@ from raytrace.system.optimization_data import Solve
 
 ROWS = Path(__file__).parents[1] / "second_order.csv"
 BUDGET = 30.0  # s, of Adam
-RATES = (0.002, 0.006, 0.02)  # of Adam: RMS blur of a step, mm, that each number makes alone
+RATES = (0.0005, 0.002, 0.006, 0.02)  # of Adam: RMS blur of a step, mm, that each number makes alone
 SEEDS = 5
 PIXEL, SIZE, NOISE = 0.005, 24, 0.02
 #: Variables, the surface of the solve, displacement, object distances, wavelengths.

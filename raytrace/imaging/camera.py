@@ -86,6 +86,7 @@ from raytrace.words import named_value
 #: The variables of a camera: of a lens, or of a phase element without one.
 V = TypeVar("V", bound=Variables | PhaseVariables)
 
+_NEAREST = 0.01  # of the nearest object distance of a camera: nearer ones are meant in another unit
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
@@ -393,6 +394,7 @@ class Camera(nn.Module, Generic[V]):
             points = self._of_field(self.points, field, count)
         if points is not None:
             check_points(points, count)
+            self._check_on_sensor(points)
             points, lens = points.to(self.fields), by_angle(nominal)
         built = None if errors is None else self._built(nominal, errors)
         about: FieldKernels | ElementKernels
@@ -459,12 +461,31 @@ class Camera(nn.Module, Generic[V]):
             kernels = self.kernels(each, points=points.to(distances)[:, places], draw=draw)
         return kernels.unflatten(0, (len(distances), -1))
 
+    def _check_on_sensor(self, points: Tensor) -> None:
+        """Raise ValueError for points (2, B) mm beyond the edges of the sensor."""
+        corners = self.sensor.corners.to(points)
+        middle, half = corners.mean(1, keepdim=True), 0.5 * (corners.amax(1) - corners.amin(1))[:, None]
+        beyond = ((points.detach() - middle).abs() > (1 + 1e-6) * half).any(0)
+        if bool(beyond.any()):
+            x, y = points.detach()[:, beyond][:, 0].tolist()
+            width, height = self.sensor.size
+            raise ValueError(
+                f"a point at ({x:g}, {y:g}) mm is beyond the edges of the sensor of {width:g} x {height:g} mm"
+            )
+
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
         """Object distances (B,) mm. Raises ValueError for none and for other shapes."""
         distances = torch.as_tensor(object_distances, dtype=self.fields.dtype, device=self.fields.device)
         if distances.dim() > 1 or not distances.numel():
             shape = tuple(distances.shape)
             raise ValueError(f"object_distances of shape {shape}: expected (B,) mm, one for each of B images, B ≥ 1")
+        near = min(self.range)
+        if bool((distances.detach().abs() < _NEAREST * near).any()):
+            least = float(distances.detach().abs().min())
+            raise ValueError(
+                f"object_distances of {least:g} mm, and the camera's are {near:g} to {max(self.range):g} mm: give mm, "
+                "or object_distances=(nearest, furthest) of the camera"
+            )
         return distances.reshape(-1)
 
     def image(

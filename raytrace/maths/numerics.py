@@ -16,6 +16,7 @@ State of torch: whether a graph, a forward derivative or a transform of torch.fu
 torch occur in this file alone. Nested transforms wrap a tensor once for each; the innermost one shows.
 """
 
+import copy
 import dataclasses
 import functools
 import types
@@ -451,8 +452,8 @@ if not TYPE_CHECKING:  # checkers of types see a dataclass, whose fields they kn
         that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. A tuple of numbers, of a field of the type
         `tuple[float | Tensor, ...]`, is a child where one of them is a tensor. There is no generated `==` (it would
         raise on tensors) and no validation on construction (it would break `vmap`): the public API refuses wrong input.
-        A class with a `__repr__` keeps it; others print large tensors by shape and range. `torch.load` accepts it:
-        restoring its fields executes nothing.
+        `copy.deepcopy` keeps the graph of tensors that have one. A class with a `__repr__` keeps it; others print large
+        tensors by shape and range. `torch.load` accepts it: restoring its fields executes nothing.
         """
         if cls.__repr__ is object.__repr__:
             cls.__repr__ = summary
@@ -474,6 +475,13 @@ if not TYPE_CHECKING:  # checkers of types see a dataclass, whose fields they kn
             child_names, structure = context
             return cls(**dict(zip(child_names, children, strict=True)), **dict(structure))
 
+        def deep_copy(instance, memo):
+            for leaf in pytree.tree_leaves(instance):
+                if isinstance(leaf, torch.Tensor) and not leaf.is_leaf:  # which torch does not copy
+                    memo[id(leaf)] = leaf.clone()
+            return cls(**{field.name: copy.deepcopy(getattr(instance, field.name), memo) for field in fields})
+
+        cls.__deepcopy__ = deep_copy
         pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
         _VALUE_TYPES.add(cls)
         torch.serialization.add_safe_globals([cls])
