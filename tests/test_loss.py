@@ -105,9 +105,10 @@ def test_a_loss_beyond_the_best_spots_is_lower_than_at_the_best_spots():
 
 @pytest.mark.slow
 def test_a_loss_of_too_few_rays_goes_on_with_more():
-    few = rt.optimize(TRIPLET, loss=low_contrast, of=Otf(rings=1), cycles=80, **FEW)
-    assert few.loss.refined >= 1
-    assert abs(few.loss.checked - few.loss.end) <= 0.02 * few.loss.checked or few.loss.refined == 3
+    few = rt.optimize(TRIPLET, loss=low_contrast, of=Otf(rings=1), cycles=300, **FEW)
+    assert few.loss.refined >= 2
+    is_same = abs(few.loss.checked - few.loss.end) <= 0.02 * few.loss.checked
+    assert is_same != ("denser rays move the loss by more than 2 %" in str(few))
     assert "with more rays" in str(few)
 
 
