@@ -211,10 +211,14 @@ def table() -> None:
                 )
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table", action="store_true", help="print the table alone")
     parser.add_argument("--lens", nargs="+", choices=LENSES, default=[*LENSES], help="of these lenses alone")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     asked = parser.parse_args()
     if asked.table:
         table()
