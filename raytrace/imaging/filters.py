@@ -15,7 +15,7 @@ from raytrace.imaging.sensor import Sensor
 class DepthInvariantFilter(nn.Module):
     """The best filter for objects at all distances (Z,) mm at once, whose pictures have the spectrum S (rows, columns).
 
-    The noise is that of the sensor.
+    The sensor gives the noise.
     """
 
     spectrum: Tensor

@@ -7,10 +7,10 @@ From M = JᵀJ and from pairs of steps p and changes y of the gradient g, the cu
     B = BFGS(c M; pairs),    c = pᵀy / pᵀM p,
 
 and with RᵀR = B/2 and r = R⁻ᵀ g/2 the square of r + R p is L + gᵀp + pᵀB p/2 but for a constant: bounds, conditions
-and the solver are those of every other merit function. Damping holds the blur of a step small, λ c |J p|²/2, and not
+and the solver serve as for every other merit function. Damping holds the blur of a step small, λ c |J p|²/2, and not
 the step of each variable alone: bendings that leave the spots as they are stay free. Steps are compared by the loss.
 
-Changes of the gradient are those of L + λᵀh, h the equalities that are held and λ their multipliers: along a curved
+Changes of the gradient belong to L + λᵀh, h the equalities that are held and λ their multipliers: along a curved
 equality the loss alone has another curvature. Pairs of negative curvature are bent towards B (Powell 1978).
 
 Source: Côté, Tseng & Heide, ACM TOG 2026 (a loss lifted into residuals of rays); Nocedal & Wright, Numerical
@@ -41,7 +41,7 @@ from raytrace.psf_models import EmptyPsf
 _PAIRS = 30  # of a step and a change of the gradient, that are kept
 _FIRST = 0.2  # of the RMS spot: blur of the first undamped step
 _FACTOR = 4.0  # by which c changes at most from one step to the next
-_POWELL = 0.2  # least curvature of a pair, relative to that of B
+_POWELL = 0.2  # least curvature of a pair, relative to B's
 _RIDGE = 0.01  # of the blur by a variable alone: least blur of a step whose parts compensate each other
 _SMALLEST = 1e-6  # of the RMS spot: blur of a step, below which its change of the gradient is rounding
 _LEAST = 1e-8  # eigenvalue of B relative to the largest

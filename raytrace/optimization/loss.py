@@ -18,7 +18,7 @@ from raytrace.optimization.quantities import Quantity
 from raytrace.system.lens import Lens
 from raytrace.words import option
 
-_MOVED = 0.02  # relative change of a loss by denser rays, with which the descent goes on
+_MOVED = 0.02  # relative change of a loss by denser rays, above which the descent continues
 _ROUNDS = 3  # of denser rays
 _UNLIMITED = 300  # cycles of a descent without other limits
 _FIRST = 100  # cycles of the rows that are minimised first
@@ -162,7 +162,7 @@ class LossDescents:
         return LossDescent(best.state.x, tuple(self.history), best.stopped, cycles, evaluations, report)
 
     def _checked(self, best: Descent, watch: Watch) -> tuple[Descent, float, int, int]:
-        """A descent that goes on with denser rays as long as these move the loss; the loss by still denser ones, the
+        """A descent that continues with denser rays as long as these move the loss; the loss by still denser ones, the
         number of descents with denser rays, and evaluations by these."""
         loss, checked, refined, evaluations = self.loss, np.nan, 0, 0
         while (denser := loss.denser()) is not None:
