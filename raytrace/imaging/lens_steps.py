@@ -40,8 +40,8 @@ class LensSteps:
     def step(self, loss: Callable[[], Tensor]) -> float:
         """Take a step that lowers a loss, a function without arguments of the current lens; its value before the step.
 
-        The loss of every call may be another one, as of another batch of pictures: its curvature follows from changes of
-        the gradient within a call.
+        The loss of every call may be another one, as of another batch of pictures: its curvature follows from changes
+        of the gradient within a call.
         """
         self._begin(loss)
         lower, upper = self._ends()
