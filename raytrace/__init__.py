@@ -258,6 +258,7 @@ ERRORS = {
     "VariedGlass": "optimization.variables",
     "VirtualImage": "analysis.focus_report",
     "WindowTooLarge": "imaging.field_kernels",
+    "WorseBetween": "optimization.between",
 }
 
 #: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All

@@ -79,6 +79,7 @@ from raytrace.materials.properties import glass as glass
 from raytrace.maths.arrays import ArrayError as ArrayError
 from raytrace.maths.numerics import to as to
 from raytrace.optimization.attained import NotReached as NotReached
+from raytrace.optimization.between import WorseBetween as WorseBetween
 from raytrace.optimization.checkpoint import BadCheckpoint as BadCheckpoint
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check

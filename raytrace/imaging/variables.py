@@ -364,11 +364,10 @@ class Variables(Owned):
             return None
         try:
             (word,) = constraint_words(hold)
-            if word == "efl":
-                length = float(first_order(self.lens).effective_focal_length)
-            else:
-                name, configuration, relation, number = split_constraint(word)
-                length = float(number) if (name, configuration, relation) == ("efl", 0, "=") else math.nan
+            name, configuration, relation, number = split_constraint(word)
+            length = math.nan
+            if (name, configuration, relation) == ("efl", 0, "="):
+                length = float(number or first_order(self.lens).effective_focal_length)
         except (BadHold, ValueError):
             length = math.nan
         if length == 0 or not math.isfinite(length):

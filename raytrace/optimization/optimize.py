@@ -15,6 +15,7 @@ import torch
 from raytrace.files import check_output
 from raytrace.maths.result import plain
 from raytrace.optimization.attained import Attained, NotReached, attained
+from raytrace.optimization.between import warn_of_worse, worse_between
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
@@ -95,7 +96,8 @@ def optimize(
     best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
-    be made (Unbuildable).
+    be made (Unbuildable), and for spots that are more than 1.5 times as large between the fields, wavelengths or rays
+    of the lens as beside them (WorseBetween; `Optimized.between`).
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance.
     """
     prepare()
@@ -371,15 +373,18 @@ def _optimized(
         history=tensor(np.reshape(cycles, (-1, 5))),
         merit_before=merits[0],
         merit_after=merits[1],
+        between=worse_between(after),
         **more,
     )
 
 
 def _warned(result: Optimized) -> Optimized:
-    """The result, with a warning for every condition that is not met, and for surfaces and gaps that cannot be made."""
+    """The result, with a warning for every condition that is not met, for spots that are much larger between the fields,
+    wavelengths or rays than at them, and for surfaces and gaps that cannot be made."""
     for condition in result.conditions:
         if not condition.met:
             warnings.warn(str(condition), NotReached, stacklevel=calling_level())
+    warn_of_worse(result.between)
     for lens in result.lens.configurations:
         warn_of_defects(lens)
     return result

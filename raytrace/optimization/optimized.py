@@ -13,6 +13,7 @@ from raytrace.io import write_lens
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Columns, Result, Table, number, plain, text_table
 from raytrace.optimization.attained import Attained
+from raytrace.optimization.between import Between
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.glass_choice import GlassStep
 from raytrace.optimization.loss import LossReport
@@ -74,6 +75,7 @@ class Optimized(Result):
     seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
     glasses were chosen. conditions: targets and values reached of conditions and boundaries. as_built: spots of the
     lens as built, if it is a term of the merit, which then includes it. loss: the way of a loss, in the place of rows.
+    between: spots between fields, wavelengths or rays that are more than 1.5 times those beside them.
     """
 
     lens: Lens
@@ -97,6 +99,7 @@ class Optimized(Result):
     conditions: tuple[Attained, ...] = ()
     as_built: AsBuiltChange | None = None
     loss: LossReport | None = None
+    between: tuple[Between, ...] = ()
 
     def draw(self, **options: Any) -> "Figure":
         """One page: lens, spots and merit function before and after."""
@@ -172,6 +175,7 @@ class Optimized(Result):
                 **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
                 **({"loss": dataclasses.asdict(self.loss)} if self.loss else {}),
                 "conditions": [condition.document() for condition in self.conditions],
+                **({"between": [dataclasses.asdict(spot) for spot in self.between]} if self.between else {}),
             }
         )
 
@@ -186,6 +190,7 @@ class Optimized(Result):
             *([f"  {self.as_built}"] if self.as_built else []),
             *([f"  {line}" for line in self.loss.lines()] if self.loss else []),
             *self._unsharp_start(),
+            *(f"  {spot}" for spot in self.between),
             "",
         ]
         variables: Columns = {

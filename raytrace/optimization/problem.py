@@ -2,7 +2,8 @@
 
 Constraint syntax is "efl=50 total_track<=80 distortion<=2% bfd>=30": a name of WORDS, a relation and a number;
 efl@2=100 applies to configuration 2, thickness:3-5>=20 to the sum of these thicknesses, and REAY(8,0,0,1,0,0)=2 to any
-operand by its arguments.
+operand by its arguments. A name alone, as "efl", keeps the number of the lens as it is; distortion, a limit, does not
+become larger.
 
 Rows of positive weight are squared; rows of negative weight, and constraints, are conditions that are met exactly.
 
@@ -120,6 +121,10 @@ def _condition(lens: Lens, word: str) -> Condition:
             f"{option('hold')}: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}"
         )
     bounds = OPERANDS[known.operand].bounds
+    if not number:
+        row = Row(known.operand, *arguments)
+        row = dataclasses.replace(row, target=_number_of(view, row, word))
+        return Condition(row, bounds or relation, configuration, name)
     if bounds and relation != bounds:
         raise BadHold(f"{option('hold')}: {word!r}: {name} is a limit on one side; expected {name}{bounds}{number}")
     try:
@@ -130,6 +135,14 @@ def _condition(lens: Lens, word: str) -> Condition:
         unit = f" in {known.unit}" if known.unit else ""
         raise BadHold(f"{option('hold')}: {word!r}: {number!r} is no number{unit}")
     return Condition(Row(known.operand, *arguments, target=target), relation, configuration, name)
+
+
+def _number_of(lens: Lens, row: Row, word: str) -> float:
+    """The number of a row of a lens as it is. Raises BadHold."""
+    number = float(Evaluation(DesignVariables(lens), (row,))(np.zeros(0)).values[0])
+    if not np.isfinite(number):
+        raise BadHold(f"{option('hold')}: {word!r} keeps the number of the lens as it is, which is {number:g}")
+    return number
 
 
 def _arguments(text: str, word: str) -> Arguments:

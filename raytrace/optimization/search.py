@@ -27,6 +27,7 @@ from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.attained import conditions_attained
+from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
@@ -86,7 +87,7 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; times_reached: number of followed descents to it, the column `found`; after: processor seconds until the
+    weights; between: largest ratio of a spot between fields, wavelengths or rays to those beside it; times_reached: number of followed descents to it, the column `found`; after: processor seconds until the
     first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of descents that were
     followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are ordered, nan
     where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused
@@ -103,6 +104,7 @@ class Searched(Result):
     spots: Tensor
     times_reached: Tensor
     after: Tensor
+    between: Tensor
     starts: int
     descents: int
     seconds: float
@@ -124,7 +126,7 @@ class Searched(Result):
         fields = {f"rms_{f}_um": 1e3 * self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
         variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
         number = torch.arange(1, len(self.lenses) + 1)
-        of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields}
+        of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields, "between": self.between}
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             of_lens |= {"merit_as_built": merit, "expected_um": 1e3 * expected, "refocused_um": 1e3 * nominal}
@@ -139,7 +141,8 @@ class Searched(Result):
         title = [
             self.before.name,
             f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
-            f"  found: by how many of the {self.descents} descents that were followed to their end",
+            f"  found: by how many of the {self.descents} descents that were followed to their end; between: the largest "
+            "ratio of an RMS spot between fields, wavelengths or rays to those beside it",
             *([f"  in the order of the merit as built: {self.tolerances}"] if self.as_built is not None else []),
             "",
         ]
@@ -155,7 +158,8 @@ class Searched(Result):
             shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
             shown |= {Column("expected", "µm", ".2f", "RMS\nas built"): 1e3 * expected}
             shown |= {Column("refocused", "µm", ".2f", "RMS\nno errors"): 1e3 * nominal}
-        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots, Column("found"): self.times_reached}
+        shown |= {Column("EFL", "mm", ".4f"): self.focal_length, **spots}
+        shown |= {Column("between", form=".2f"): self.between, Column("found"): self.times_reached}
         return [Table(shown, title)]
 
     @style.styled
@@ -231,7 +235,8 @@ def searched(
         focal_length=torch.stack(
             [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
         ),
-        spots=torch.stack([_spots(lens_of_minimum) for lens_of_minimum in lenses]),
+        spots=torch.stack([spot(lens_of_minimum).whole.rms_radius for lens_of_minimum in lenses]),
+        between=tensor([max((gap.ratio for gap in between(each)), default=np.nan) for each in lenses]),
         times_reached=torch.tensor([minimum.descents for _, minimum in minima]),
         after=tensor([minimum.seconds for _, minimum in minima]),
         starts=starts,
@@ -284,15 +289,6 @@ def _as_built(problem: Problem, minimum: Minimum, settings: ExpectationSettings)
     with torch.no_grad():
         spots = [float(q(lens)) ** 0.5 for q in (term.expected, term.nominal)]
     return problem.merit(problem.evaluated(x), x), *spots
-
-
-def _spots(lens: Lens) -> Tensor:
-    """RMS radius (F,) in mm about the centroid of all wavelengths, by their weights."""
-    each = spot(lens, wavelengths=lens.wavelengths)
-    share = lens.wavelength_weights / lens.wavelength_weights.sum()
-    centre = (each.centroid * share).sum(-1, keepdim=True)
-    apart = (each.centroid - centre).square().sum(0)
-    return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
 
 
 def _draw(axes: "Axes", result: Searched, k: int) -> None:
@@ -411,6 +407,7 @@ def search(
         lens, each, starts=run.started, descents=run.followed, stopped=stopped,
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
+    warn_of_worse([gap for gap in between(result.lens) if gap.is_worse])
     if folder is not None and not (share and share.rank):
         try:
             result.save(folder)

@@ -11,7 +11,7 @@ thickness:6@2                 in configuration 2, of a number that differs betwe
 curvature:4=-curvature:3      pickup: a factor times another number plus an offset, as thickness:8=2*thickness:2+1
 curvature:7=f_number(4)       solve, a row of SOLVED_BY
 thickness:2..15 sensor:57,58  bounds, of `bounds_of`; an open end is left out
-efl=50 total_track<=80        constraints, split by `constraint_words`
+efl=50 total_track<=80        constraints, split by `constraint_words`; "efl" alone keeps the number of the lens
 
 `design_variables` makes the `DesignVariables` of a lens of them (`optimization.lens_state`).
 """
@@ -440,8 +440,9 @@ def constraint_words(hold: str | Sequence[str] | None) -> list[str]:
 
 
 def split_constraint(word: str) -> tuple[str, int, str, str]:
-    """Name, configuration (0: the current one), relation (=, <= or >=) and number of "efl@2=100". Raises BadHold."""
-    parts = re.fullmatch(r"([^<>=≤≥@]+?)(?:@(\d+))?(<=|>=|==|[<>=≤≥])(.+)", word)
+    """Name, configuration (0: the current one), relation (=, <= or >=) and number of "efl@2=100"; of "efl" alone the
+    relation is = and the number "", that of the lens as it is. Raises BadHold."""
+    parts = re.fullmatch(r"([^<>=≤≥@]+?)(?:@(\d+))?(?:(<=|>=|==|[<>=≤≥])(.+))?", word)
     if not parts:
         raise BadHold(f"{option('hold')}: {word!r}: expected a name, = or <= or >=, and a number, as efl=50")
-    return parts[1], int(parts[2] or 0), _RELATIONS[parts[3]], parts[4]
+    return parts[1], int(parts[2] or 0), _RELATIONS[parts[3] or "="], parts[4] or ""
