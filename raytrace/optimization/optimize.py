@@ -379,7 +379,7 @@ def _optimized(
 
 
 def _warned(result: Optimized) -> Optimized:
-    """The result, with a warning for every condition that is not met, for spots that are much larger between the fields,
+    """The result, with a warning for every condition that is not met, for spots that are much larger between fields,
     wavelengths or rays than at them, and for surfaces and gaps that cannot be made."""
     for condition in result.conditions:
         if not condition.met:

@@ -87,11 +87,12 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; between: largest ratio of a spot between fields, wavelengths or rays to those beside it; times_reached: number of followed descents to it, the column `found`; after: processor seconds until the
-    first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of descents that were
-    followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are ordered, nan
-    where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of the refocused
-    lens without errors; tolerances: of which errors.
+    weights; between: the largest ratio of an RMS spot between fields, wavelengths or rays to those beside it
+    (`optimization.between`); times_reached: number of followed descents to it, the column `found`; after: processor
+    seconds until the first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of
+    descents that were followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are
+    ordered, nan where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of
+    the refocused lens without errors; tolerances: of which errors.
     """
 
     before: Lens
@@ -141,8 +142,8 @@ class Searched(Result):
         title = [
             self.before.name,
             f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
-            f"  found: by how many of the {self.descents} descents that were followed to their end; between: the largest "
-            "ratio of an RMS spot between fields, wavelengths or rays to those beside it",
+            f"  found: by how many of the {self.descents} descents that were followed to their end",
+            "  between: the largest ratio of an RMS spot between fields, wavelengths or rays to those beside it",
             *([f"  in the order of the merit as built: {self.tolerances}"] if self.as_built is not None else []),
             "",
         ]
