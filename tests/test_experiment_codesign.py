@@ -413,10 +413,10 @@ def test_the_page_names_settings_that_are_not_usual():
     assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
     assert kept_of(page) == "By hand."
     assert "[claims.csv](codesign/claims.csv)" in page
-    assert "[codesign_sweep.md](codesign_sweep.md)" in page
+    assert "[sweep.csv](codesign/sweep.csv)" in page
     other = markdown(dataclasses.replace(report, is_of_paper=False).parts())
     assert "paper" not in other
-    assert "codesign_sweep.md" not in other
+    assert "sweep.csv" not in other
     second = markdown(dataclasses.replace(report, folder="second", is_of_paper=False).parts())
     assert "--page second" in second.splitlines()[4]
     assert "](second/loss.png)" in second
