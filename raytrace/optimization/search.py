@@ -31,6 +31,7 @@ from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
+from raytrace.optimization.one_element import FromLens
 from raytrace.optimization.opening import opened
 from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
@@ -42,7 +43,8 @@ from raytrace.optimization.problem import (
     conditions_in_unit,
     optimization_data_of,
 )
-from raytrace.optimization.saddle_points import Insertion, surfaces_of
+from raytrace.optimization.removal import elements_of, removals
+from raytrace.optimization.saddle_points import SIDES, insertions, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -73,7 +75,7 @@ if TYPE_CHECKING:
 #: Why a search ends.
 STOPPED = {
     "starts": "all starts were tried",
-    "surfaces": "both sides of every surface",
+    "surfaces": "all moves from the lens were followed",
     "seconds": "the limit on time was reached",
     "interrupted": "interrupted; these were found so far",
 }
@@ -342,6 +344,7 @@ def search(
     hold: str | Sequence[str] | Sequence[Condition] | None = None,
     starts: int | None = None,
     insert: bool | Sequence[int] | None = None,
+    delete: bool | Sequence[int] | None = None,
     seconds: float | None = None,
     seed: int = 0,
     as_built: ExpectationSettings | None = None,
@@ -352,13 +355,15 @@ def search(
     """The distinct minima of a merit function globally, within bounds; the lens is one of the starts.
 
     merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
-    which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
+    which is that of `hold`, of a row EFFL or of the lens. starts: how many. Instead of starts, insert: True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
-    more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. as_built: `AsBuilt`, the expected mean
-    square spot of the manufactured lens: the minima are those of the merit function alone, in the order of the merit
-    with this term; of each lens with the tolerances of its own surfaces. folder: keeps the minima as lens
-    files, a table and figures, and the journal: called again the search resumes, with the same result as without the
-    interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all descents is written there.
+    more (`saddle_points.py`); or delete: True, or first surfaces of elements, each of which is flattened and thinned
+    until it is gone, to lenses with one element less (`removal.py`). seconds: after which it ends; seed: of the draws.
+    as_built: `AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of the merit
+    function alone, in the order of the merit with this term; of each lens with the tolerances of its own surfaces.
+    folder: keeps the minima as lens files, a table and figures, and the journal: called again the search resumes, with
+    the same result as without the interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all
+    descents is written there.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch, BadTolerance.
     """
     if as_built is not None:
@@ -379,20 +384,24 @@ def search(
     ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
     task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
     until = started + (np.inf if seconds is None else seconds)
-    surfaces: tuple[int, ...] = ()
-    if insert is not None and insert is not False:
-        if starts is not None:
-            raise NoProblem(
-                f"{option('starts')} goes without {option('insert')}, which begins at the lens alone, on both sides "
-                "of every surface"
-            )
-        surfaces = surfaces_of(free, () if insert is True else tuple(insert))
     if conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
-    run: Insertion | _Run
-    if surfaces:
-        run = Insertion(task, Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until), surfaces)
+    run: FromLens | _Run
+    given = [asked for asked in (starts, insert, delete) if asked is not None and asked is not False]
+    if len(given) > 1:
+        raise NoProblem(
+            f"{option('starts')}, {option('insert')} and {option('delete')} exclude one another: the last two begin at "
+            "the lens alone"
+        )
+    if insert is not None and insert is not False:
+        surfaces = surfaces_of(free, () if insert is True else tuple(insert))
+        journal = Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until)
+        run = FromLens(task, journal, insertions(task, surfaces), len(SIDES) * len(surfaces), "insert")
+    elif delete is not None and delete is not False:
+        elements = elements_of(free, conditions, () if delete is True else tuple(delete))
+        journal = Journal(folder, {**task.about(seed), "delete": list(elements)}, until)
+        run = FromLens(task, journal, removals(task, elements), len(elements), "delete")
     else:
         run = _Run(task, Journal(folder, task.about(seed), until), seed, STARTS if starts is None else starts)
     stopped = run.DONE
