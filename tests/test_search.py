@@ -354,6 +354,35 @@ def test_an_element_that_was_inserted_is_removed_again(best_triplet):
     assert len(again.lens.surfaces) == len(lens.surfaces)
 
 
+# -- minima of a loss --------------------------------------------------------------------------------------------------
+
+
+def mean_distance(points):
+    """A loss that is no sum of squares: the mean distance of rays from their centroid, mm."""
+    about = points - points.mean((-2, -1), keepdim=True)
+    return (about.square().sum(0) + 1e-12).sqrt().mean()
+
+
+def test_minima_of_the_merit_are_followed_to_minima_of_a_loss(tmp_path):
+    triplet = rt.read_lens("cooke_triplet").at(wavelengths=[0.5876])
+    how = {"merit": "spot", "vary": "curvature:1,2 sensor", "hold": "efl", "starts": 2, "seed": 1}
+    how["bounds"] = "sensor:60..90"
+    of_merit = rt.search(triplet, **how)
+    of_loss = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    quantity = rt.optimization.Points(8)  # by which the ends are checked
+    values = [float(mean_distance(quantity(lens))) for lens in of_loss.lenses]
+    assert of_loss.loss.tolist() == pytest.approx(values, rel=1e-9)
+    assert values == sorted(values)
+    assert values[0] < 0.999 * min(float(mean_distance(quantity(lens))) for lens in of_merit.lenses)
+    assert of_loss.focal_length.tolist() == pytest.approx(of_merit.focal_length.tolist(), rel=1e-6)
+    assert (of_loss.merit >= of_merit.merit.min() * (1 - 1e-6)).all()
+    again = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    assert torch.equal(again.variables, of_loss.variables)
+    assert "loss" in str(of_loss)
+    with pytest.raises(NoProblem, match="as_built"):
+        rt.search(triplet, loss=mean_distance, as_built=rt.tolerancing.AsBuilt(grade="precision"), **how)
+
+
 # -- the journal -------------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import Condition, NoProblem, Problem
+from raytrace.optimization.problem import Condition, NoProblem
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -48,7 +48,7 @@ class FromLens:
     moves: Callable[[Lens], Iterator[Move]]
     count: int
     name: str
-    families: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
+    families: dict[tuple, tuple[SearchProblem, Minima]] = field(default_factory=dict)
     started: int = 0  # descents
 
     DONE: ClassVar[str] = "surfaces"
@@ -83,7 +83,7 @@ class FromLens:
         tasks = [(key, lambda descent=descent: descent(until)) for key, descent in move.descents]
         ends = self.journal.each(tasks, len(space.lower))
         ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.families.setdefault(_family(move.task), (move.task.whole, Minima(ranges)))
+        _, minima = self.families.setdefault(_family(move.task), (move.task, Minima(ranges)))
         for (key, _), end in zip(tasks, ends, strict=True):
             work += end.seconds
             minima.add(end, key, work)
@@ -94,9 +94,9 @@ class FromLens:
                 bar.set_postfix_str(f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else "")
         return sum(end.seconds for end in ends)
 
-    def each(self) -> list[tuple[Problem, Minimum]]:
+    def each(self) -> list[tuple[SearchProblem, Minimum]]:
         """All minima, the best first, each with its problem."""
-        minima = [(problem, minimum) for problem, distinct in self.families.values() for minimum in distinct.each]
+        minima = [(task, minimum) for task, distinct in self.families.values() for minimum in distinct.each]
         return sorted(minima, key=lambda pair: pair[1].result.merit)
 
 
