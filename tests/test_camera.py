@@ -40,7 +40,7 @@ from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import Run, Share
-from raytrace.imaging.variables import Variables
+from raytrace.imaging.variables import PhaseVariables, Variables
 from raytrace.io import read_lens
 from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models import Gaussian, psf
@@ -49,6 +49,7 @@ from raytrace.system.lens import with_object_distance
 from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.focus import NoImage, best_focus
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.wave_optics.element import phase_element
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
 SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
@@ -548,3 +549,52 @@ def test_a_lens_that_follows_parameters_is_copied_with_its_graph():
     assert float(gradient) == 1.0
     fixed = copy.deepcopy(variables.lens)
     assert fixed.surfaces[1].curvature is not variables.lens.surfaces[1].curvature
+
+
+def test_a_training_resumes_bit_identically_with_the_order_of_its_first_call(tmp_path):
+    """Adam moves the sensor by -1 mm: a plan for this lens has another order."""
+    pictures = torch.rand(2, 22, 22, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    lens = read_lens("cooke_triplet").at(wavelengths=[0.55])
+
+    def started():
+        torch.manual_seed(0)
+        network = RedNet(RedNetShape(2, 2))
+        own = Camera(Variables(lens, "sensor"), network, sensor=NOISY, fields=[0], pixels=7, model="drt")
+        return own, torch.optim.Adam(own.rates(optics=1.0, network=1e-3))
+
+    def train(own, optimizer, steps):
+        for step in steps:
+            loss = (own(pictures, [2e4, 3e4], index=[2 * step, 2 * step + 1]) - own.target(pictures)).abs().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+    own, optimizer = started()
+    train(own, optimizer, range(1))
+    torch.save({"camera": own.state_dict(), "optimizer": optimizer.state_dict()}, tmp_path / "state.pt")
+    resumed, again = started()
+    stored = torch.load(tmp_path / "state.pt", weights_only=True)
+    resumed.load_state_dict(stored["camera"])
+    again.load_state_dict(stored["optimizer"])
+    assert torch.equal(resumed.kernels([2e4, 3e4]), own.kernels([2e4, 3e4]))
+    for each in ((own, optimizer), (resumed, again)):
+        train(*each, range(1, 3))
+    ends = [[*each.parameters()] for each in (own, resumed)]
+    assert all(map(torch.equal, *ends))
+    assert own.plan() != started()[0].plan()
+
+
+def test_a_state_keeps_an_order_that_is_given_and_the_sampling_of_an_element():
+    lens = read_lens("cooke_triplet")
+    own = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[0], model=Gaussian(order=2))
+    other = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[0], model=Gaussian(order=3))
+    other.load_state_dict(own.state_dict())
+    assert (own._order, other._order) == (2, 3)
+    element = phase_element([0.0, -1e-3], profile="powers", aperture=1.0, glass=1.5)
+    alone = [
+        Camera(PhaseVariables(element), Same(), sensor=NOISY, sensor_distance=35.5, object_distances=(1e3, 2e3))
+        for _ in range(2)
+    ]
+    alone[0].plan()
+    alone[1].load_state_dict(alone[0].state_dict())
+    assert alone[1]._sampling == alone[0]._sampling

@@ -83,6 +83,20 @@ def test_a_step_leaves_bounds_fixed_numbers_and_copies():
     torch.save(own, io.BytesIO())
 
 
+def test_steps_of_a_loaded_state_are_those_that_were_not_interrupted():
+    """The curvature that the first steps have found is in the state."""
+    model = rt.psf_models.Gaussian(order=3)
+    own, resumed = camera("curvature:1 sensor", model=model), camera("curvature:1 sensor", model=model)
+
+    def step(of):
+        return of.lens_step(lambda: -of.kernels(2e4).square().sum())
+
+    step(own)
+    resumed.load_state_dict(own.state_dict())
+    assert step(own) == step(resumed)
+    assert resumed.variables.numbers() == own.variables.numbers()
+
+
 def test_a_camera_without_a_lens_says_what_to_do():
     element = rt.wave_optics.phase_element([0.0, -1e-3], profile="powers", aperture=1.0, glass=1.5)
     own = rt.Camera(rt.imaging.PhaseVariables(element), torch.nn.Identity(), sensor_distance=35.5, sensor=rt.Sensor())

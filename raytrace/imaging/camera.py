@@ -120,7 +120,8 @@ class Camera(nn.Module, Generic[V]):
     each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
-    its variables and the sensor, and loads only into a camera with the same ones.
+    its variables and the sensor, and loads only into a camera with the same ones; it holds the order of the PSF model
+    and the curvature of `lens_step`, so that a resumed training is bit-identical.
     Warns UnfilledStop once, for the lens at construction.
     """
 
@@ -296,10 +297,28 @@ class Camera(nn.Module, Generic[V]):
         }
 
     def get_extra_state(self) -> Tensor:
-        return encoded_text(self.description())
+        """The description, the sampling of the PSFs as `plan` fixed it, and the curvature that `lens_step` knows."""
+        return encoded_text(
+            {
+                **self.description(),
+                "order": self._order,
+                "sampling": self._sampling and dataclasses.asdict(self._sampling),
+                "lens_steps": self._steps and self._steps.memory(),
+            }
+        )
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Does nothing: a state is compared before it is loaded."""
+        """Resume with the sampling of the PSFs and the steps of the lens of the state, which was compared before.
+
+        An order that the parameters of the PSF model give remains.
+        """
+        stored = decoded_text(state)
+        if stored["model"] == self.model and getattr(self.psf_parameters, "order", None) is None:
+            self._order = stored.get("order", self._order)
+        if sampling := stored.get("sampling"):
+            self._sampling = Plan(**{**sampling, "band": tuple(sampling["band"])})
+        memory = stored.get("lens_steps")
+        self._steps = None if memory is None else LensSteps(self.variables, memory)
 
     def _load_from_state_dict(
         self, state_dict: dict, prefix: str, local_metadata: dict, strict: bool, missing: list[str], *lists: list[str]
