@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,7 @@ from raytrace.imaging.codesign import (
     run_model,
     write_outcome,
 )
+from raytrace.imaging.field_kernels import EnergyOutside
 from raytrace.imaging.image import blur
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import dead_leaves, split
@@ -43,11 +45,11 @@ from raytrace.imaging.training import Run, Share
 from raytrace.imaging.variables import PhaseVariables, Variables
 from raytrace.io import read_lens
 from raytrace.maths.sampling import gauss_rings
-from raytrace.psf_models import Gaussian, psf
+from raytrace.psf_models import DRT, Gaussian, Paraxial, psf
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
 from raytrace.system.parameter_paths import BadVariables
-from raytrace.tracing.focus import NoImage, best_focus
+from raytrace.tracing.focus import NoImage, best_focus, focused
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.wave_optics.element import phase_element
 
@@ -540,6 +542,32 @@ def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():
         own(torch.rand(1, 1, 32, 32), 25.0)
     with pytest.raises(ValueError, match="beyond the edges of the sensor of 24 x 16 mm"):
         own(torch.rand(1, 1, 32, 32), 25e3, points=torch.tensor([[12.1], [0.0]]))
+
+
+@pytest.mark.parametrize(("model", "field"), [(Paraxial(), 0), (Gaussian(order=4), 11), (DRT(order=2), 11)])
+def test_light_outside_the_windows_is_a_number_and_a_warning(model, field):
+    """Kernels of sum 1 hide it: of a sensor 3 mm out of focus, of a field whose beam is vignetted."""
+    lens = focused(read_lens("cooke_triplet").at(f_number=16, wavelengths=[0.55]), 2e4)
+    own = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[field], pixels=11, model=model)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EnergyOutside)
+        own.kernels(2e4)
+    with torch.no_grad():
+        own.variables.sensor.fill_(3.0)
+    expected = psf(
+        own.variables(), model, fields=own.fields, object_distances=[2e4], center="chief", pixel=0.005, size=11
+    )
+    outside = own.energy_outside([2e4])
+    assert float(outside) == pytest.approx(float(expected.energy_outside), rel=1e-2)  # chief rays differ
+    assert 0.5 < float(outside) < 1
+    slope = torch.autograd.grad(outside.sum(), own.variables.sensor)[0]
+    assert float(slope) > 0
+    with pytest.warns(EnergyOutside, match=rf"{100 * float(outside):.0f} % of the light .* 11 pixels"):
+        kernels = own.kernels(2e4)
+    assert float(kernels.sum()) == pytest.approx(1, abs=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EnergyOutside)
+        own.kernels(2e4)
 
 
 def test_a_lens_that_follows_parameters_is_copied_with_its_graph():

@@ -172,7 +172,7 @@ class Lifted:
         """The scale of the curvature and the places of the pairs, as plain values for JSON."""
         return {
             "scale": self.scale,
-            "places": [[part.tolist() for part in (at.x, at.gradient, at.slope)] for at in self.places],
+            "places": [[part.tolist() for part in (place.x, place.gradient, place.slope)] for place in self.places],
         }
 
     def resume(self, memory: dict) -> None:
