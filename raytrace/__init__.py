@@ -209,6 +209,7 @@ ERRORS = {
     "EmptyPsf": "psf_models.result",
     "EmptyPupil": "psf_models.dft",
     "EmptySpot": "tracing.spot",
+    "EnergyOutside": "imaging.field_kernels",
     "FailedElsewhere": "shards",
     "HeightMapError": "wave_optics.height_maps",
     "ImplausibleWavelength": "materials.glass",
