@@ -72,6 +72,17 @@ def known_option(verb: str, word: str, names: tuple[str, ...], options: Mapping,
     return word
 
 
+def former_name(before: str, now: str) -> Callable:
+    """The method `before` of a class, which warns and calls the method `now`."""
+
+    def method(self: object, *values: object, **options: object) -> object:
+        message = f"{type(self).__name__}.{before} is {type(self).__name__}.{now}; the former name goes with version 0.3"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return getattr(self, now)(*values, **options)
+
+    return method
+
+
 def nameless(value: object, names: Iterable[str]) -> str:
     """The message for a value without the name of its option; names: options that take a name."""
     names = [*names]

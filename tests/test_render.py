@@ -672,6 +672,29 @@ def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
 # -- a camera
 
 
+def test_a_rendering_of_a_camera_prints_without_a_warning_of_torch(triplet):
+    camera = rt.Camera(rt.Variables(triplet, "curvature:1"), torch.nn.Identity(), sensor=FIELD)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rendering = camera.render(random(3, ROWS, COLUMNS), tol=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "illumination" in str(rendering)
+        rendering.document()
+
+
+def test_former_names_of_a_recorded_rendering_warn(triplet):
+    sensor = dataclasses.replace(FIELD, mosaic="RGGB")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rendering = rt.render(triplet, random(3, ROWS, COLUMNS), sensor=sensor, model="gaussian", tol=0.5)
+    for before, now in {"recorded": "raw", "captured": "demosaiced"}.items():
+        with pytest.warns(DeprecationWarning, match=f"Rendering.{before} is Rendering.{now}"):
+            image = getattr(rendering, before)(0).image
+        assert torch.equal(image, getattr(rendering, now)(0).image)
+    assert rendering.raw(0).image.shape[0] == 1
+
+
 @pytest.mark.slow
 def test_a_camera_renders_with_its_current_lens(triplet):
     """Its sensor, PSF model and variables: the image follows the sensor distance, with its derivative."""

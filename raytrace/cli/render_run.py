@@ -65,7 +65,7 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
             else:
                 how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
                 rendering = rendering.another(load(), options["depth"], **how)
-            capture = rendering.recorded if arguments.raw else rendering.captured
+            capture = rendering.raw if arguments.raw else rendering.demosaiced
             recorded = capture(torch.tensor(number), arguments.seed)
         target = targets[number]
         if target is not None:

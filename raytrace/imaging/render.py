@@ -63,7 +63,7 @@ from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, former_name
 
 #: A PSF model, its order and the pixels across its window.
 Rung: TypeAlias = tuple[str, int, int]
@@ -1025,17 +1025,20 @@ class Rendering(Result):
         image = ready(light, depth, **options)
         return dataclasses.replace(self, image=image, picture=binned(light, ready.sampling))
 
-    def recorded(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """The raw rendering (..., 1, H, W): with the noise, the quantisation and the Bayer mosaic of the sensor.
+    def raw(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """The rendering with the noise, the quantisation and the Bayer mosaic (..., 1, H, W) of the sensor.
 
         index, seed: of the noise, see `Sensor.capture`.
         """
         return dataclasses.replace(self, image=self.optics.sensor.capture(self.image, index, seed))
 
-    def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """The rendering as `recorded`, with the missing colours of the mosaic interpolated."""
-        recorded = self.recorded(index, seed)
-        return dataclasses.replace(recorded, image=self.optics.sensor.demosaic(recorded.image))
+    def demosaiced(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """The rendering as `raw`, with the missing colours of the mosaic interpolated (..., C, H, W)."""
+        raw = self.raw(index, seed)
+        return dataclasses.replace(raw, image=self.optics.sensor.demosaic(raw.image))
+
+    recorded = former_name("recorded", "raw")
+    captured = former_name("captured", "demosaiced")
 
     def save(self, path: str | PathLike, bits: int = 8) -> None:
         """Write a single image of one or three channels.
@@ -1076,7 +1079,7 @@ class Rendering(Result):
         if math.isfinite(ready.error):
             lines.append(f"estimated error between the places {ready.error:.1e} of the light")
         if ready.haze is not None:
-            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.max()):.1f} %")
+            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.detach().max()):.1f} %")
         if ready.lit is not None:
             dark = 100 * (1 - float(ready.lit.double().mean()))
             lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")
@@ -1097,7 +1100,7 @@ class Rendering(Result):
         ready = self.optics
         if ready.illumination is None or (ready.lit is not None and not bool(ready.lit.any())):
             return None
-        return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).min())
+        return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).detach().min())
 
     def _ends(self, ideal: Tensor) -> np.ndarray:
         """Column and row (2, 2) of the last and the first pixel on the diagonal that light reaches."""
