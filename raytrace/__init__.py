@@ -206,9 +206,9 @@ ERRORS = {
     "DamagedRun": "imaging.training",
     "DarkPlaces": "imaging.field_kernels",
     "EmptyPsf": "psf_models.result",
-    "EmptyPupil": "psf_models.dft",
     "EmptySpot": "tracing.spot",
     "FailedElsewhere": "shards",
+    "GoalMissed": "tolerancing.analysis",
     "HeightMapError": "wave_optics.height_maps",
     "ImplausibleWavelength": "materials.glass",
     "Incomplete": "analysis.setting",
@@ -305,7 +305,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *ERRORS})
+    return sorted(__all__)
 
 
 def public_name(name: str) -> Any:

@@ -74,6 +74,11 @@ class _Parser(argparse.ArgumentParser):
             meant = "; figures are saved by --plot" if drawn else did_you_mean(name, known)
             meant = "; tables are saved by -o FILE.csv" if name == "--csv" and "-o" in known else meant
             self.error(f"unknown option {name}{meant}")
+        if unknown:
+            places = [action for action in self._actions if not action.option_strings]
+            takes = " ".join(f"{'one ' if action.nargs is None else ''}{action.metavar}" for action in places)
+            more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
+            self.error(f"unexpected {unknown[0]}{more}: the command takes {takes or 'options alone'}")
         return arguments, unknown
 
     def _check_value(self, action: argparse.Action, value: object) -> None:

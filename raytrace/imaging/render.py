@@ -53,7 +53,7 @@ from raytrace.materials.glass import OutOfRange
 from raytrace.maths.numerics import placed, varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, Figure, array, new_figure, styled
-from raytrace.psf_models import MODELS, NotConverged
+from raytrace.psf_models import MODELS, NotConverged, model_name
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.system.lens import Lens, check_media, field_points, is_round_about_axis, with_wavelengths
 from raytrace.tracing.f_number import axial_f_number
@@ -285,8 +285,7 @@ def optics(
     if sampling > 1:
         columns, rows = sensor.pixels
         sensor = dataclasses.replace(sensor, pixels=(sampling * columns, sampling * rows), mosaic="none")
-    if model not in (None, *MODELS):
-        raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    model = None if model is None else model_name(model)
     if order is not None and model is None and not elements:
         raise ValueError(f"order {order} of no model: give model=…, one of {', '.join(MODELS)}")
     model = model or ("wave" if elements else None)
@@ -1079,7 +1078,9 @@ class Rendering(Result):
         if math.isfinite(ready.error):
             lines.append(f"estimated error between the places {ready.error:.1e} of the light")
         if ready.haze is not None:
-            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.detach().max()):.1f} %")
+            lines.append(
+                f"light beyond the window, spread evenly: at most {100 * float(ready.haze.detach().max()):.1f} %"
+            )
         if ready.lit is not None:
             dark = 100 * (1 - float(ready.lit.double().mean()))
             lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")

@@ -29,7 +29,7 @@ from raytrace.words import RaytraceError, calling_level
 
 _LOG = logging.getLogger(__name__)
 _MOST = 1 << 34  # bytes of a checkpoint
-_ANEW = "remove it to begin anew"
+_RESTART = "remove it to restart the training"
 
 #: Numbers of a step by the name of their column in the log.
 Record = dict[str, float]
@@ -57,7 +57,7 @@ class DamagedRun(RaytraceError, ValueError):
 
 RUN = Kind(
     DamagedRun,
-    "remove the folder to begin anew",
+    "remove the folder to restart the training",
     OtherSettings,
     "{path} holds another run: {difference}; choose another folder",
 )
@@ -80,15 +80,13 @@ def read_state(path: Path) -> dict:
             if not isinstance(state, dict):
                 raise Unfit(f"it holds a {type(state).__name__}")
         except Exception as error:  # zipfile and torch raise errors of any class
-            raise Unfit(f"no checkpoint, or a damaged one ({_in_line(error) or type(error).__name__})") from error
+            raise Unfit(f"not a readable checkpoint ({_in_line(error) or type(error).__name__})") from error
         return state
 
     try:
-        return read_file(path, decode, DamagedRun, "remove it to begin anew", _MOST)
+        return read_file(path, decode, DamagedRun, _RESTART, _MOST)
     except OSError as error:
-        raise DamagedRun(
-            f"{path}: no checkpoint, or a damaged one ({error.strerror}); remove it to begin anew"
-        ) from error
+        raise DamagedRun(f"{path}: not a readable checkpoint ({error.strerror}); {_RESTART}") from error
 
 
 def write_state(path: Path, state: dict) -> None:
@@ -206,15 +204,14 @@ def train(
         whole = value if added is None or mine.rank else value + added.to(value.dtype)
         if whole.requires_grad:
             whole.backward()
-        summed = _sum_over_processes(parameters, value.detach())
-        if not math.isfinite(summed):
-            last = (
-                f"the last checkpoint is {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was made yet"
-            )
-            raise NotFinite(f"step {step}: the loss is {summed}, or its gradient is none; {last}")
+        total_loss, has_gradient = _sum_over_processes(parameters, value.detach())
+        if not (has_gradient and math.isfinite(total_loss)):
+            problem = "a gradient is not finite" if math.isfinite(total_loss) else f"the loss is {total_loss}"
+            last = f"last checkpoint: {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was written yet"
+            raise NotFinite(f"step {step}: {problem}; lower the learning rate; {last}")
         optimizer.step()
         after_step()
-        record = {"loss": summed} | ({} if added is None else {"penalty": float(added.detach())}) | record
+        record = {"loss": total_loss} | ({} if added is None else {"penalty": float(added.detach())}) | record
         rows.append((step, record))
         step += 1
         due = step % every == 0 or step == steps or time.monotonic() - saved_at >= seconds
@@ -222,17 +219,16 @@ def train(
             # The log first: rows after a checkpoint are dropped on resuming, missing ones could not be restored.
             run.append(rows)
             run.save({"step": step, "module": module.state_dict(), "optimizer": optimizer.state_dict()})
-            _LOG.info("step %d of %d: loss %.6g", step, steps, summed)
+            _LOG.info("step %d of %d: loss %.6g", step, steps, total_loss)
             rows, saved_at = [], time.monotonic()
         yield step - 1, record
 
 
-def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> float:
-    """Sum gradients and the loss over processes; NaN if any gradient is not finite."""
+def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> tuple[float, bool]:
+    """Sum gradients and the loss over processes; returns the loss, and whether all gradients are finite."""
     if share().processes > 1:
         for parameter in parameters:
             # The sums are equal in all processes to the last bit, so that all take the same step.
             parameter.grad = total(torch.zeros_like(parameter) if parameter.grad is None else parameter.grad)
         value = total(value)
-    finite = all(bool(torch.isfinite(p.grad).all()) for p in parameters if p.grad is not None)
-    return float(value) if finite else math.nan
+    return float(value), all(bool(torch.isfinite(p.grad).all()) for p in parameters if p.grad is not None)

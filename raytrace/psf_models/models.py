@@ -47,7 +47,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import RaytraceWarning, calling_level, option
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean, option
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 _PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
@@ -153,6 +153,9 @@ _ROWS = (
 )
 # fmt: on
 
+#: Names of the diffraction PSF in other programs.
+_DIFFRACTION = ("huygens", "fft")
+
 #: The models by name, in order of growing fidelity.
 MODELS = {row.name: row for row in _ROWS}
 
@@ -166,12 +169,21 @@ class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stays above the tolerance at the finest order."""
 
 
+def model_name(name: str, *others: str) -> str:
+    """The name of a model in MODELS, or one of the `others`, from a name in any case. Raises ValueError."""
+    known, word = (*others, *MODELS), name.lower()
+    if word not in known:
+        meant = "; the diffraction PSF is wave" if word in _DIFFRACTION else did_you_mean(name, known)
+        raise ValueError(f"model {name!r} is not known; expected {', '.join(known)}{meant}")
+    return word
+
+
 def model_of(name: str, **numbers: Any) -> Parameters:
     """A model with its numbers, by its name. Raises ValueError for an unknown name or number."""
-    if name == "auto" and "rays" in numbers:
-        raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
-    if name not in MODELS:
-        raise ValueError(f"the model {name!r} has no numbers; expected {', '.join(MODELS)}")
+    if name == "auto":
+        given = ", ".join(numbers)
+        raise ValueError(f"auto chooses by a tolerance: leave {given} out, or name the model that has {given}")
+    name = model_name(name)
     if "rays" in numbers and not MODELS[name].traces:
         raise ValueError(f"{name} traces no rays: leave rays out")
     known = {field.name for field in dataclasses.fields(MODELS[name].parameters)}
@@ -235,9 +247,8 @@ def psf(
     """
     execution = execution or Execution()
     center = center or ("chief" if fields is None or grid is None else "axis")
-    name = model if isinstance(model, str) else name_of(model)
+    name = model_name(model, "auto") if isinstance(model, str) else name_of(model)
     for parameter, (word, words) in {
-        "model": (name, ("auto", *MODELS)),
         "center": (center, ("axis", "chief", "centroid")),
         "window": (window, ("follows", "fixed")),
         "normalise": (normalise, ("energy", "window")),
