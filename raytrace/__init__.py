@@ -201,7 +201,7 @@ ERRORS = {
     "ChangesNothing": "tracing.ray_listing",
     "Circle": "optimization.merit",
     "ClippedBeam": "analysis.sheared_batch",
-    "CommandError": "cli.run",
+    "CommandError": "cli.runner",
     "DamagedLine": "stores",
     "DamagedRun": "imaging.training",
     "DarkPlaces": "imaging.field_kernels",

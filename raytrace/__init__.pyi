@@ -40,7 +40,7 @@ from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong
-from raytrace.cli.run import CommandError as CommandError
+from raytrace.cli.runner import CommandError as CommandError
 from raytrace.cli.settings import BadSettings as BadSettings
 from raytrace.files import NotWritten as NotWritten
 from raytrace.imaging import Camera as Camera

@@ -43,7 +43,7 @@ from raytrace.cli.codesign_run import (
     settings_of,
     train_run,
 )
-from raytrace.cli.run import CommandError, present, say
+from raytrace.cli.runner import CommandError, present, say
 from raytrace.cli.settings import documents, words
 from raytrace.cli.types import file_name, seed_number
 from raytrace.files import table

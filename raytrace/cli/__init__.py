@@ -5,8 +5,8 @@ only when the command runs, so that `raytrace --help` answers at once.
 
 - `commands`: the table of commands, each with its summary, examples and options; `options`: the table of options that
   several commands share; `types`: readers of their values.
-- `run`: the runner: opens the lens, calls the function, prints, saves; `progress`: bars.
-- `runs`, `render_run`: commands that do more.
+- `runner`: opens the lens, calls the function, prints, saves; `progress`: bars.
+- `runs`, `render_run`: functions of commands that do more.
 - `codesign`, `wave_…`, `settings`: co-design and phase elements, whose options are fields of settings.
 
 To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function and an
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             from raytrace.budget import within
             from raytrace.cli.progress import heartbeat
-            from raytrace.cli.run import carry_out
+            from raytrace.cli.runner import carry_out
 
             with heartbeat(arguments.command), within(getattr(arguments, "max_bytes", None)):
                 code = carry_out(arguments)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import raytrace
 from raytrace.cli.progress import Bar, Lines, progress
-from raytrace.cli.run import CommandError, open_lens, options_of, say
+from raytrace.cli.runner import CommandError, open_lens, options_of, say
 from raytrace.cli.types import OutputFolder
 from raytrace.imaging.image import linearised
 from raytrace.imaging.render import checked_depth, default_sensor
