@@ -64,7 +64,7 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
                 rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=advance)
             else:
                 how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
-                rendering = rendering.another(load(), options["depth"], **how)
+                rendering = rendering.with_picture(load(), options["depth"], **how)
             capture = rendering.raw if arguments.raw else rendering.demosaiced
             recorded = capture(torch.tensor(number), arguments.seed)
         target = targets[number]
