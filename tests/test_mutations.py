@@ -178,7 +178,7 @@ def logs(folder: Path) -> Reader:
 
     def read(path: Path) -> None:
         run.rows()
-        run.forget_after(5)
+        run.drop_rows_from(5)
 
     return Reader((run.log.read_bytes(),), from_file(read, run.log), (DamagedRun,))
 
