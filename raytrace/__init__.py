@@ -165,6 +165,7 @@ PUBLIC = {
     "wiener": "imaging.restoration",
     "Camera": "imaging",
     "DepthInvariantFilter": "imaging.filters",
+    "LensPictures": "imaging.lens_pictures",
     "PhaseVariables": "imaging",
     "RedNet": "imaging",
     "Run": "imaging.training",

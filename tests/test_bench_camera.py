@@ -39,7 +39,7 @@ def test_every_row_and_the_figure(capsys, tmp_path):
 def test_a_lens_of_the_user_has_its_largest_field_in_the_corners(capsys):
     assert main(["bench", "camera", "tessar", "--repeats", "1", "--threads", "1"]) == 0
     text = capsys.readouterr().out
-    chip = rt.render("tessar", torch.zeros(3, 72, 96)).optics.sensor
+    chip = rt.render(rt.focus(rt.read_lens("tessar")).lens, torch.zeros(3, 72, 96)).optics.sensor
     assert f"Lens tessar at its best focus, sensor of {chip.size[0]:.4g} × {chip.size[1]:.4g} mm" in text
 
 

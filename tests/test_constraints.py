@@ -220,10 +220,28 @@ def test_a_condition_may_be_of_one_configuration(lens):
     assert [one.configuration for one in found] == [1, 2, 0]
 
 
+def test_a_name_alone_keeps_the_number_of_the_lens(lens):
+    zoom = lens.with_configurations(thickness={6: [12.4281, 16.0]})
+    kept, track, limit = conditions_of(zoom, "efl@2 total_track distortion")
+    second = zoom.configuration(2)
+    assert kept.row.target == pytest.approx(float(rt.first_order(second).effective_focal_length), rel=1e-12)
+    assert track.row.target == pytest.approx(sum(float(surface.thickness) for surface in lens.surfaces[1:-1]))
+    assert (kept.relation, kept.configuration, limit.relation) == ("=", 2, "<=")
+    result = rt.optimize(lens, merit="spot", vary="curvature:1-4", hold="efl", cycles=2)
+    focal_length = rt.first_order(lens).effective_focal_length
+    assert float(rt.first_order(result.lens).effective_focal_length) == pytest.approx(float(focal_length), rel=1e-8)
+
+
+def test_a_number_that_a_lens_does_not_have_is_not_kept(lens):
+    afocal = lens.replace(11, curvature=math.inf)
+    with pytest.raises(BadHold, match="keeps the number of the lens as it is, which is nan"):
+        conditions_of(afocal, "efl")
+
+
 @pytest.mark.parametrize(
     ("hold", "said"),
     [
-        ("efl", "expected a name, = or <= or >=, and a number"),
+        ("efl>", "expected a name, = or <= or >=, and a number"),
         ("efl=long", "'long' is no number in mm"),
         ("efl=inf", "'inf' is no number"),
         ("f_number=4mm", "'4mm' is no number"),

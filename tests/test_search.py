@@ -16,10 +16,12 @@ import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
+from raytrace.optimization.one_element import thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.problem import NoProblem, conditions_of
-from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
+from raytrace.optimization.removal import Removal, without_element
+from raytrace.optimization.saddle_points import Place, enlarged, saddle
 from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
     BadSearch,
@@ -219,7 +221,7 @@ def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
         rt.system.Row("MXCG", (1, 6), target=9.0, weight=1),
         rt.system.Row("EFFL"),
     )
-    numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
+    numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, (3, 4), part)]  # noqa: E731
     others = [("MXCG", (1, 6), 9.0), ("EFFL", (0, 0), 0.0)]
     assert numbers(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
     assert numbers(0.5) == [*numbers(0), ("MNEG", (3, 4), 1.0)]
@@ -305,6 +307,80 @@ def test_from_a_triplet_to_better_lenses_of_four_elements():
     assert (four.merit < three.merit_after).all()
     assert float(four.merit[0]) < 0.65 * three.merit_after
     assert float(four.spots[0].max()) < 0.008
+
+
+# -- one element less --------------------------------------------------------------------------------------------------
+
+
+def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
+    asked, lens = best_triplet
+    removal = Removal(3, lens, asked)
+    stage = removal._stage(0.0)
+    x = np.clip(removal._whole.model.start, stage.lower, stage.upper)
+    thin, reduced = removal._whole.model.lens_at(x), removal.reduced
+    assert [surface.glass.name for surface in reduced.model.lens.surfaces].count("SK4") == 2
+    assert torch.allclose(rt.spot(without_element(thin, 3)).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
+    assert len(reduced.model.variables) == len(asked.model.variables) - 4
+    assert reduced.whole.merit(reduced.whole.evaluated(removal._without(x)), removal._without(x)) == pytest.approx(
+        stage.problem.merit(stage.problem.evaluated(x), x), rel=1e-9
+    )
+
+
+def test_the_stop_and_the_image_keep_their_places(best_triplet):
+    _, lens = best_triplet
+    assert (lens.stop, without_element(lens, 6).stop, without_element(lens, 1).stop) == (5, 5, 3)
+    for k in (1, 3, 6):
+        total = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
+        shorter = sum(float(surface.thickness) for surface in without_element(lens, k).surfaces[1:-1])
+        gone = sum(float(surface.thickness) for surface in lens.surfaces[1:3]) if k == 1 else 0.0
+        assert shorter == pytest.approx(total - gone, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_an_element_that_was_inserted_is_removed_again(best_triplet):
+    """Of four elements the removal of any, the best one of all, is at least as good as the triplet."""
+    asked, lens = best_triplet
+    how = {
+        "merit": asked.rows,
+        "vary": "curvature thickness",
+        "hold": "efl=100",
+        "bounds": "thickness:1..30 sensor:60..120",
+    }
+    three = rt.optimize(lens, **how)
+    four = rt.search(lens, insert=[4], **how)
+    again = rt.search(four.lens, delete=True, **how)
+    assert (again.stopped, again.starts) == ("surfaces", 4)
+    assert float(again.merit[0]) <= 1.001 * three.merit_after
+    assert len(again.lens.surfaces) == len(lens.surfaces)
+
+
+# -- minima of a loss --------------------------------------------------------------------------------------------------
+
+
+def mean_distance(points):
+    """A loss that is no sum of squares: the mean distance of rays from their centroid, mm."""
+    about = points - points.mean((-2, -1), keepdim=True)
+    return (about.square().sum(0) + 1e-12).sqrt().mean()
+
+
+def test_minima_of_the_merit_are_followed_to_minima_of_a_loss(tmp_path):
+    triplet = rt.read_lens("cooke_triplet").at(wavelengths=[0.5876])
+    how = {"merit": "spot", "vary": "curvature:1,2 sensor", "hold": "efl", "starts": 2, "seed": 1}
+    how["bounds"] = "sensor:60..90"
+    of_merit = rt.search(triplet, **how)
+    of_loss = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    quantity = rt.optimization.Points(8)  # by which the ends are checked
+    values = [float(mean_distance(quantity(lens))) for lens in of_loss.lenses]
+    assert of_loss.loss.tolist() == pytest.approx(values, rel=1e-9)
+    assert values == sorted(values)
+    assert values[0] < 0.999 * min(float(mean_distance(quantity(lens))) for lens in of_merit.lenses)
+    assert of_loss.focal_length.tolist() == pytest.approx(of_merit.focal_length.tolist(), rel=1e-6)
+    assert (of_loss.merit >= of_merit.merit.min() * (1 - 1e-6)).all()
+    again = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    assert torch.equal(again.variables, of_loss.variables)
+    assert "loss" in str(of_loss)
+    with pytest.raises(NoProblem, match="as_built"):
+        rt.search(triplet, loss=mean_distance, as_built=rt.tolerancing.AsBuilt(grade="precision"), **how)
 
 
 # -- the journal -------------------------------------------------------------------------------------------------------
@@ -428,10 +504,17 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
         ),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
-        (["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"], "--starts goes without --insert"),
+        (
+            ["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"],
+            "--starts, --insert and --delete exclude one another",
+        ),
         (["--merit", "spot", "--vary", "curvature", "--insert", "3"], "surface 3 is none before the image"),
         (["--merit", "spot", "--vary", "curvature:1", "--insert", "2"], "has a curvature that does not vary"),
         (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
+        (["--merit", "spot", "--vary", "thickness", "--delete"], "no spherical element between air"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "2"], "begins no element"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "1"], "begins the element that is the stop"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "--insert"], "exclude one another"),
     ],
 )
 def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_path):

@@ -287,10 +287,11 @@ COMMANDS = (
         "find the minima of a merit function globally, within bounds",
         "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
         "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
-        "optimised; the best are converged, and the search hops on from the best minima. --insert instead adds an "
-        "element: a thin meniscus at a surface is a saddle point that leads to new minima. --as-built orders the "
-        "minima by the merit with the expected spot of the manufactured lens, and lists both. -o stores every minimum "
-        "as a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
+        "optimised; the best are converged, and the search hops on from the best minima. Instead --insert adds an "
+        "element, as a thin meniscus at a surface is a saddle point that leads to new minima, and --delete removes "
+        "each element in turn. --as-built orders the minima by the merit with the expected spot of the manufactured "
+        "lens, and lists both. -o stores every minimum as a lens file, a table, figures and the state of the search: "
+        "the same command resumes there bit-identically. "
         "Ctrl-C stops and keeps the minima found. Processes share the work: "
         "torchrun --nproc-per-node 2 -m raytrace search …",
         """
@@ -298,6 +299,7 @@ COMMANDS = (
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
         cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
+        double_gauss --merit spot --vary curvature thickness --hold efl=100 --edge 1 --delete -o fewer
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
         *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
         group(
@@ -305,6 +307,8 @@ COMMANDS = (
             Option("starts", count, "N", "initial designs (default 64)"),
             Option("insert", count, "SURFACE", "instead of starts: insert a thin meniscus at every surface, or at "
                 "these", nargs="*"),
+            Option("delete", count, "SURFACE", "instead of starts: remove each element, or those of these first "
+                "surfaces, flattened and thinned while the rest follows", nargs="*"),
             "seconds",
             row("seed", "of starts and hops"),
         ),

@@ -109,8 +109,9 @@ def _of_lens(lens: Lens, configuration: int) -> Iterator[Between]:
 def _about_whole(lens: Lens, fields: Tensor, wavelengths: Tensor) -> Tensor:
     """RMS radii (F, W) of single wavelengths about the centroid of the lens's own wavelengths together."""
     centre = spot(lens, fields=fields).whole.centroid
-    each = spot(with_wavelengths(lens, wavelengths), fields=fields).each
-    return (each.mean_square_radius + (each.centroid - centre[..., None]).square().sum(0)).sqrt()
+    primary_first = torch.cat([lens.primary.reshape(1), wavelengths])
+    each = spot(with_wavelengths(lens, primary_first), fields=fields).each
+    return (each.mean_square_radius + (each.centroid - centre[..., None]).square().sum(0)).sqrt()[:, 1:]
 
 
 def _largest(
