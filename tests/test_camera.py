@@ -411,7 +411,7 @@ def test_kernels_of_several_wavelengths_are_their_weighted_sum():
     blue, red, both = found.values()
     torch.testing.assert_close(both, 0.25 * blue + 0.75 * red, rtol=0, atol=1e-6)
     assert float((blue - red).detach().abs().max()) > 1e-3
-    with pytest.raises(ValueError, match="1 weights of 2 wavelengths"):
+    with pytest.raises(ValueError, match="1 wavelength_weights for 2 wavelengths"):
         camera(read_lens(LENS), dataclasses.replace(SMALL, wavelengths=(0.48, 0.62)))
 
 
