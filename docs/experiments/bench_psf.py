@@ -2,7 +2,7 @@
 
     python docs/experiments/bench_psf.py --docs FOLDER
 
-docs/speed_vs_error.md quotes the targets; all rows are in docs/speed_vs_error.csv. Random rays are brought to an error
+docs/compare.md quotes the targets; all rows are in docs/speed_vs_error.csv. Random rays are brought to an error
 of 1 %, direct Huygens sums to 1e-3; numbers of rays that would take too long are extrapolated.
 """
 
