@@ -165,6 +165,7 @@ PUBLIC = {
     "wiener": "imaging.restoration",
     "Camera": "imaging",
     "DepthInvariantFilter": "imaging.filters",
+    "LensPictures": "imaging.lens_pictures",
     "PhaseVariables": "imaging",
     "RedNet": "imaging",
     "Run": "imaging.training",
@@ -201,14 +202,15 @@ ERRORS = {
     "ChangesNothing": "tracing.ray_listing",
     "Circle": "optimization.merit",
     "ClippedBeam": "analysis.sheared_batch",
-    "CommandError": "cli.run",
+    "CommandError": "cli.runner",
     "DamagedLine": "stores",
     "DamagedRun": "imaging.training",
     "DarkPlaces": "imaging.field_kernels",
     "EmptyPsf": "psf_models.result",
-    "EmptyPupil": "psf_models.dft",
     "EmptySpot": "tracing.spot",
+    "EnergyOutside": "imaging.field_kernels",
     "FailedElsewhere": "shards",
+    "GoalMissed": "tolerancing.analysis",
     "HeightMapError": "wave_optics.height_maps",
     "ImplausibleWavelength": "materials.glass",
     "Incomplete": "analysis.setting",
@@ -305,7 +307,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *ERRORS})
+    return sorted(__all__)
 
 
 def public_name(name: str) -> Any:

@@ -40,12 +40,13 @@ from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong
-from raytrace.cli.run import CommandError as CommandError
+from raytrace.cli.runner import CommandError as CommandError
 from raytrace.cli.settings import BadSettings as BadSettings
 from raytrace.files import NotWritten as NotWritten
 from raytrace.imaging import Camera as Camera
 from raytrace.imaging import Variables as Variables
 from raytrace.imaging.field_kernels import DarkPlaces as DarkPlaces
+from raytrace.imaging.field_kernels import EnergyOutside as EnergyOutside
 from raytrace.imaging.field_kernels import WindowTooLarge as WindowTooLarge
 from raytrace.imaging.pictures import NoPictures as NoPictures
 from raytrace.imaging.render import BeyondFields as BeyondFields
@@ -99,7 +100,6 @@ from raytrace.optimization.variables import BadHold as BadHold
 from raytrace.optimization.variables import VariedGlass as VariedGlass
 from raytrace.psf_models import psf as psf
 from raytrace.psf_models.dft import Aliased as Aliased
-from raytrace.psf_models.dft import EmptyPupil as EmptyPupil
 from raytrace.psf_models.dft import TooManyPoints as TooManyPoints
 from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
@@ -113,6 +113,7 @@ from raytrace.system.parameter_paths import BadVariables as BadVariables
 from raytrace.system.parameter_paths import UnknownNumber as UnknownNumber
 from raytrace.system.prescription import BadPrescription as BadPrescription
 from raytrace.system.prescription import lens as lens
+from raytrace.tolerancing.analysis import GoalMissed as GoalMissed
 from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.as_built import Unlit as Unlit
 from raytrace.tolerancing.grades import tolerances as tolerances

@@ -72,6 +72,19 @@ def known_option(verb: str, word: str, names: tuple[str, ...], options: Mapping,
     return word
 
 
+def former_name(before: str, now: str) -> Callable:
+    """The method `before` of a class, which warns and calls the method `now`."""
+
+    def method(self: object, *values: object, **options: object) -> object:
+        message = (
+            f"{type(self).__name__}.{before} is {type(self).__name__}.{now}; the former name goes with version 0.3"
+        )
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return getattr(self, now)(*values, **options)
+
+    return method
+
+
 def nameless(value: object, names: Iterable[str]) -> str:
     """The message for a value without the name of its option; names: options that take a name."""
     names = [*names]
@@ -93,11 +106,12 @@ def in_command(flags: Mapping[str, str]) -> Iterator[None]:
 
 
 def option(name: str, value: object = "") -> str:
-    """An option as a message names it: `ray_aiming=real` in Python, --ray-aiming real in a command that has it."""
+    """An option as a message names it: `ray_aiming=real` in Python, --ray-aiming real in a command that has it; of a
+    switch `geometric=True` and --geometric."""
     flag, text = _flags.get({}).get(name), str(value)
     if flag is None:
         return f"`{name}={text}`" if text else f"`{name}`"
-    return f"{flag} {text}" if text else flag
+    return flag if text in ("", "True") else f"{flag} {text}"
 
 
 class _Options(dict[str, str]):

@@ -2,23 +2,19 @@
 
 import pytest
 import torch
-from problems import vector  # noqa: F401 - the tests' search path
 
 import raytrace as rt
 from raytrace.optimization.between import Between, WorseBetween, between, worse_between
+
+TRIPLET = rt.read_lens("cooke_triplet")
 
 
 def by_samples(lens):
     return {gap.samples: gap for gap in between(lens)}
 
 
-@pytest.fixture(scope="module")
-def triplet():
-    return rt.read_lens("cooke_triplet")
-
-
-def test_the_spot_between_two_fields_is_that_of_the_field_halfway(triplet):
-    lens = triplet.at(fields=[0, 10])  # without the vignetting factors of the file
+def test_the_spot_between_two_fields_is_that_of_the_field_halfway():
+    lens = TRIPLET.at(fields=[0, 10])  # without the vignetting factors of the file
     gap = by_samples(lens)["fields"]
     radii = rt.spot(lens, fields=[0, 5, 10]).whole.rms_radius
     assert gap.place == "at 5°"
@@ -26,8 +22,8 @@ def test_the_spot_between_two_fields_is_that_of_the_field_halfway(triplet):
     assert gap.nearest == pytest.approx(float(radii[[0, 2]].max()), rel=1e-12)
 
 
-def test_the_spot_of_a_wavelength_between_counts_its_displacement(triplet):
-    lens = triplet.at(fields=[11.9], wavelengths=[0.45, 0.7])
+def test_the_spot_of_a_wavelength_between_counts_its_displacement():
+    lens = TRIPLET.at(fields=[11.9], wavelengths=[0.45, 0.7])
     gap = by_samples(lens)["wavelengths"]
     each = rt.spot(lens, wavelengths=[float(lens.primary), 0.575]).arrivals
     about = rt.spot(lens).whole.centroid
@@ -38,8 +34,8 @@ def test_the_spot_of_a_wavelength_between_counts_its_displacement(triplet):
     assert gap.radius == pytest.approx(float(expected), rel=1e-9)
 
 
-def test_an_optimised_lens_says_where_its_spots_are_worse(triplet):
-    lens = triplet.at(fields=[0, 20])
+def test_an_optimised_lens_says_where_its_spots_are_worse():
+    lens = TRIPLET.at(fields=[0, 20])
     with pytest.warns(WorseBetween, match="between the fields, at 10°.*add fields"):
         result = rt.optimize(lens, merit="spot", vary="curvature thickness:2,4 sensor", cycles=20)
     radii = rt.spot(result.lens, fields=[0, 10, 20]).whole.rms_radius
@@ -50,17 +46,17 @@ def test_an_optimised_lens_says_where_its_spots_are_worse(triplet):
     assert result.document()["between"][0]["radius"] == gap.radius
 
 
-def test_a_lens_that_is_even_over_its_field_says_nothing(triplet):
-    assert worse_between(triplet) == ()
+def test_a_lens_that_is_even_over_its_field_says_nothing():
+    assert worse_between(TRIPLET) == ()
 
 
-def test_every_configuration_is_looked_at(triplet):
-    zoom = triplet.at(fields=[0, 20]).with_configurations(thickness={4: [2.0, 3.0]})
+def test_every_configuration_is_looked_at():
+    zoom = TRIPLET.at(fields=[0, 20]).with_configurations(thickness={4: [2.0, 3.0]})
     assert {gap.configuration for gap in between(zoom)} == {1, 2}
 
 
-def test_spots_without_light_are_left_out(triplet):
-    assert all(torch.isfinite(torch.tensor(gap.ratio)) for gap in between(triplet.at(fields=[0, 60])))
+def test_spots_without_light_are_left_out():
+    assert all(torch.isfinite(torch.tensor(gap.ratio)) for gap in between(TRIPLET.at(fields=[0, 60])))
 
 
 def test_a_spot_of_no_size_is_not_worse():

@@ -168,7 +168,7 @@ def test_memory_that_runs_out_names_the_largest_option(capsys, monkeypatch):
     def run(arguments):
         raise MemoryError
 
-    monkeypatch.setattr("raytrace.cli.run.carry_out", run)
+    monkeypatch.setattr("raytrace.cli.runner.carry_out", run)
     assert main(["psf", "cooke_triplet", "--size", "5000"]) == 1
     assert "not enough memory; ask for less by --size, which is 5000" in capsys.readouterr().err
 

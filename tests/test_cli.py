@@ -304,6 +304,12 @@ def test_bad_usage_is_one_line(run, arguments):
     assert "--help" in done.error
 
 
+def test_a_second_lens_is_unexpected(run):
+    done = run("info", "double_gauss", "tessar", "singlet")
+    assert done.code == 2
+    assert "unexpected tessar and 1 more: the command takes one LENS" in done.error
+
+
 BAD_LENSES = {
     "empty.zmx": ("", r"empty\.zmx.*empty"),
     "binary.zmx": ("\x00\x01\x17\xff" * 500, r"binary\.zmx.*binary"),

@@ -24,7 +24,7 @@ import raytrace as rt
 from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser, options
 from raytrace.cli.commands import COMMANDS, WAVE_COMMANDS
-from raytrace.cli.run import RUNNER_OPTIONS, find_lens
+from raytrace.cli.runner import RUNNER_OPTIONS, find_lens
 from raytrace.cli.types import PICTURES, picture_file
 from raytrace.imaging.sensor import PATTERNS
 from raytrace.io import read_lens

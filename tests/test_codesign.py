@@ -13,11 +13,11 @@ from raytrace.imaging.codesign import (
     batch,
     camera,
     closed_form,
+    default_settings,
     freeze_lens,
     lens_at_start,
     optimise,
     pupil_points,
-    usual,
 )
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import OtherSettings, Run
@@ -216,8 +216,8 @@ def test_a_folder_older_than_a_setting_has_its_default(tmp_path):
     given = dataclasses.asdict(SMALL)
     old = {name: value for name, value in given.items() if name not in ("rays", "decay", "spread", "sampling")}
     (tmp_path / "settings.json").write_text(json.dumps(old))
-    Run(tmp_path, given, usual=usual(SMALL))
+    Run(tmp_path, given, usual=default_settings(SMALL))
     with pytest.raises(OtherSettings, match="decay was 'none', now 'cosine'"):
-        Run(tmp_path, {**given, "decay": "cosine"}, usual=usual(SMALL))
+        Run(tmp_path, {**given, "decay": "cosine"}, usual=default_settings(SMALL))
     with pytest.raises(OtherSettings, match="decay was None"):
         Run(tmp_path, given)

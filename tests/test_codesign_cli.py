@@ -355,7 +355,7 @@ WRONG = {
     "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
     "resume": (["--resume"], "out: no run was started here"),
     "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
-    "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8,12"),
+    "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8..12"),
     "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables"),
     "field": (["--field", "95"], "a field angle is below 90 degrees"),
 }

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scripts import script
 
-from raytrace.cli.run import CommandError
+from raytrace.cli.runner import CommandError
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element_files import read_label

@@ -77,7 +77,7 @@ KINDS = {
         pytest.param(
             kind,
             name,
-            marks=() if name == "landing points" or kind == "clipped" else pytest.mark.slow,
+            marks=() if name == "points" or kind == "clipped" else pytest.mark.slow,
             id=f"{kind}, {name}",
         )
         for kind in KINDS
@@ -104,7 +104,7 @@ def test_derivatives_by_errors_are_their_differences(aiming):
     found = rt.jacobian(lens, tolerances=rows, fields=FIELDS, pupil=PUPIL)
     steps = torch.tensor([1e-3 * row.maximum for row in rows], dtype=torch.float64)
     landing = rays_behind(
-        rt.tolerancing.perturbed(lens, rows, torch.cat([torch.diag(steps), -torch.diag(steps)])), "landing points"
+        rt.tolerancing.perturbed(lens, rows, torch.cat([torch.diag(steps), -torch.diag(steps)])), "points"
     )
     plus, minus = landing.chunk(2, 1)
     difference = ((plus - minus) / (2 * steps.reshape(-1, 1, 1, 1))).movedim(1, 0)
@@ -218,6 +218,13 @@ def test_the_result_prints_and_is_a_document():
     assert "landing points" in text
     assert found.to_frame()["variable"].tolist() == ["curvature_1", "thickness_7"]
     assert np.asarray(found.document()["derivatives"]).shape == (2, 2, 2, 3, 144)
+
+
+def test_the_landing_points_are_named_as_of_optimize():
+    points, former = (rt.jacobian(COOKE, "curvature:1", of=of, fields=[0.0]) for of in ("points", "landing points"))
+    assert torch.equal(points.derivatives, former.derivatives)
+    with pytest.raises(ValueError, match="expected points, directions, paths, merit or a function"):
+        rt.jacobian(COOKE, "curvature:1", of="spots")
 
 
 def test_a_quantity_without_derivatives_is_reported():

@@ -186,3 +186,56 @@ def test_a_descent_begins_at_the_start_where_rays_fail_at_the_best_spots():
     assert np.isnan(result.loss.first)
     assert result.loss.end < result.loss.start
     assert "rays of the loss fail at the best spots" in str(result)
+
+
+# -- configurations, pictures, rings of the check
+
+
+def test_a_loss_has_all_configurations_along_the_axis_of_distances():
+    zoom = TRIPLET.with_configurations(thickness={4: [2.0, 3.0]})
+    shapes = []
+
+    def loss(points):
+        shapes.append(points.shape)
+        return mean_square(points)
+
+    result = rt.optimize(
+        zoom, loss=loss, of=Points(4), object_distances=[5e3, 1e5], first=None, restarts=0, cycles=2,
+        vary="curvature:1-4 thickness:4", hold="efl@1=101.18",
+    )  # fmt: skip
+    assert shapes[0][1] == 4
+    each = [Points(4)(view, torch.tensor([5e3, 1e5])) for view in result.lens.configurations]
+    assert float(mean_square(torch.cat(each, 1))) == pytest.approx(result.merit_after, rel=1e-9)
+    assert float(rt.first_order(result.lens.configuration(1)).effective_focal_length) == pytest.approx(101.18, rel=1e-6)
+
+
+def test_pictures_are_those_of_the_kernels_and_lower_a_loss():
+    scenes = torch.rand(2, 1, 40, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    kernels = Kernels(pixel=0.01, pixels=15, order=3)
+    of = rt.imaging.LensPictures(scenes, kernels)
+    pictures = of(TRIPLET, torch.tensor([2e4, 1e5]))
+    spread = kernels(TRIPLET, torch.tensor([2e4, 1e5]))
+    assert pictures.shape == (2, 2, 3, 3, 26, 26)
+    expected = rt.imaging.blur(scenes[1, 0], spread[1, 2, 0])
+    assert torch.allclose(pictures[1, 1, 2, 0], expected, atol=1e-12)
+    sharp = scenes[:, None, None, :, 7:-7, 7:-7]
+    result = rt.optimize(
+        TRIPLET, loss=lambda seen: (seen - sharp).square().mean(), of=of, vary="sensor curvature:6",
+        first=None, restarts=0, cycles=3,
+    )  # fmt: skip
+    assert result.merit_after < 0.9 * result.merit_before
+    with pytest.raises(ValueError, match="LensPictures"):
+        rt.optimize(TRIPLET, loss=mean_square, of="pictures", **FEW)
+
+
+def test_the_rings_of_the_check_may_be_given():
+    rays = []
+
+    def loss(points):
+        rays.append(points.shape[-1])
+        return mean_square(points)
+
+    rt.optimize(TRIPLET, loss=loss, of=Points(3), check_rings=9, first=None, cycles=1, **FEW)
+    assert rays[-1] == Points(9)(TRIPLET).shape[-1]
+    with pytest.raises(NoProblem, match="check_rings"):
+        rt.optimize(TRIPLET, loss=lambda lens: lens.wavelengths.sum(), of="lens", check_rings=9, **FEW)

@@ -301,6 +301,7 @@ def test_an_unreachable_tolerance_is_reported():
     ("options", "message"),
     [
         ({"model": "geometric"}, "model 'geometric' is not known; expected auto, paraxial"),
+        ({"model": "Huygens"}, "expected auto, .*wave; the diffraction PSF is wave"),
         ({"center": "middle"}, "center 'middle' is not known"),
         ({"normalise": "peak"}, "normalise 'peak' is not known"),
         ({"model": Gaussian(rays=5), "tol": 0.1}, "exclude each other"),
@@ -323,12 +324,16 @@ def test_arguments_that_make_no_sense_are_refused(options, message):
         psf(double_gauss(), **{"model": "gaussian", **options})
 
 
+def test_the_name_of_a_model_is_read_in_any_case():
+    assert psf(double_gauss(), "Gaussian", fields=field(0.0)).model == "gaussian"
+
+
 @pytest.mark.parametrize(
     ("name", "numbers", "message"),
     [
         ("auto", {"rays": 100}, "auto chooses by a tolerance"),
         ("paraxial", {"rays": 100}, "paraxial traces no rays"),
-        ("geometric", {}, "'geometric' has no numbers; expected paraxial"),
+        ("geometric", {}, "model 'geometric' is not known; expected paraxial"),
     ],
 )
 def test_numbers_of_another_model_are_refused(name, numbers, message):

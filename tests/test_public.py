@@ -24,6 +24,7 @@ from raytrace.system.lens import field_points
 from raytrace.tracing.launch import launch
 from raytrace.tracing.spot import spot_of
 from raytrace.tracing.trace import trace_lens
+from raytrace.words import in_command, option
 
 ROWS = [
     {"radius": 61.47, "thickness": 6.0, "glass": "N-BK7"},
@@ -578,6 +579,27 @@ def test_errors_speak_of_keywords_from_python_and_of_options_from_the_command(ca
     assert "--through-focus needs one spatial frequency: give --frequency" in capsys.readouterr().err
     assert main(["spot", "cooke_triplet", "--sampling", "sobol", "--rings", "4"]) == 1
     assert "--rings belongs to --sampling gauss, hexapolar; sobol takes --points" in capsys.readouterr().err
+
+
+def test_a_switch_is_named_without_a_value():
+    assert option("geometric", True) == "`geometric=True`"
+    with in_command({"geometric": "--geometric"}):
+        assert option("geometric", True) == "--geometric"
+
+
+def test_completion_offers_the_names_that_are_typed():
+    assert dir(rt) == sorted(rt.__all__)
+
+
+def test_the_functions_of_tolerances_have_their_public_names():
+    assert rt.tolerance.__name__ == "tolerance"
+    assert rt.tolerances.__name__ == "tolerances"
+
+
+@pytest.mark.parametrize("name", ["efl", "focal_length", "effective_focal_length", "f_number"])
+def test_first_order_data_that_a_lens_lacks_are_named_with_their_function(name):
+    with pytest.raises(AttributeError, match=r"rt\.first_order\(lens\)\.(effective_focal_length|f_number)$"):
+        getattr(rt.lens(ROWS, stop=1, f_number=5), name)
 
 
 def test_a_result_without_columns_refuses_to_be_a_table():

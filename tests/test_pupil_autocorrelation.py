@@ -141,6 +141,20 @@ def test_text_json_and_figure_report_which_fields_are_geometric(rough, monkeypat
     assert json.loads(capsys.readouterr().out)["transfer"] == "diffraction"
 
 
+def test_a_blur_of_too_many_points_names_the_option_and_the_field_outside(monkeypatch, capsys):
+    monkeypatch.setattr(aperture, "_MOST", 100)
+    lens = defocused(1.5)
+    with pytest.raises(
+        aperture.TooManyPoints, match=r"use geometric rays, `geometric=True`; field 15 degrees is outside .*, 14$"
+    ):
+        rt.mtf(lens, [5.0], fields=[15.0], geometric=False)
+    with pytest.raises(aperture.TooManyPoints, match=r"use geometric rays, `geometric=True`$"):
+        rt.mtf(lens, [5.0], fields=[14.0], geometric=False)
+    conditions = "--sensor-distance", "59.4", "--field", "14"
+    assert main(["mtf", "double_gauss", *conditions, "--frequency", "5", "--no-geometric"]) == 1
+    assert "use geometric rays, --geometric" in capsys.readouterr().err
+
+
 def test_a_long_trace_is_predicted(rough, monkeypatch):
     monkeypatch.setattr(aperture, "_SURFACE_SECONDS", 1e-3)
     with pytest.warns(TakesLong, match=r"[0-9,]+ rays: .*minutes; .*use geometric rays"):

@@ -454,7 +454,7 @@ def test_a_grey_picture_and_one_smaller_than_a_kernel(triplet):
 @pytest.mark.parametrize(
     ("picture", "options", "message"),
     [
-        (torch.zeros(3, 30, 48), {}, "48 × 30 pixels on a sensor of 48 × 32"),
+        (torch.zeros(3, 30, 48), {}, "picture 48 × 30 pixels, sensor 48 × 32 pixels: .*resize the picture"),
         (torch.zeros(2, ROWS, COLUMNS), {}, "2 channels on a sensor of 3"),
         (torch.full((3, ROWS, COLUMNS), math.nan), {}, "numbers of the picture are not finite"),
         (torch.zeros(3, ROWS, COLUMNS, dtype=torch.int64), {}, "its white is unknown"),
@@ -568,7 +568,7 @@ def test_the_model_is_the_first_that_the_next_confirms(triplet):
         small = rt.Sensor(size=(1.2, 0.8), pixels=(48, 32))
         result = rt.render(triplet.at(fields=[1.0]), torch.ones(32, 48).double(), sensor=small, tol=0.05)
     assert result.optics.model == "drt"
-    assert "PSF model drt, 3 wavelengths; left out: diffraction" in str(result)
+    assert "PSF model drt, 3 wavelengths; neglected: diffraction" in str(result)
     kernel = result.optics.kernels[0, 0, 0, 0]
     lines = torch.arange(len(kernel), dtype=torch.float64)
     row, column = ((kernel.sum(axis) * lines).sum() for axis in (1, 0))
@@ -670,6 +670,29 @@ def test_a_scene_is_sampled_more_finely_than_the_sensor(triplet):
 
 
 # -- a camera
+
+
+def test_a_rendering_of_a_camera_prints_without_a_warning_of_torch(triplet):
+    camera = rt.Camera(rt.Variables(triplet, "curvature:1"), torch.nn.Identity(), sensor=FIELD)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rendering = camera.render(random(3, ROWS, COLUMNS), tol=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "illumination" in str(rendering)
+        rendering.document()
+
+
+def test_former_names_of_a_recorded_rendering_warn(triplet):
+    sensor = dataclasses.replace(FIELD, mosaic="RGGB")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rendering = rt.render(triplet, random(3, ROWS, COLUMNS), sensor=sensor, model="gaussian", tol=0.5)
+    for before, now in {"recorded": "raw", "captured": "demosaiced"}.items():
+        with pytest.warns(DeprecationWarning, match=f"Rendering.{before} is Rendering.{now}"):
+            image = getattr(rendering, before)(0).image
+        assert torch.equal(image, getattr(rendering, now)(0).image)
+    assert rendering.raw(0).image.shape[0] == 1
 
 
 @pytest.mark.slow

@@ -63,7 +63,7 @@ def sensor(lens=LENS, response="rgb", **others):
 def rendered(picture, lens=LENS, *, camera=None, seed=0, index=0, **options):
     with torch.no_grad():
         one = rt.render(lens, picture, sensor=camera or sensor(), **{"tol": 0.3, "model": "gaussian", **options})
-    return one.captured(index, seed).image
+    return one.demosaiced(index, seed).image
 
 
 def written(path="out.png"):
@@ -260,7 +260,7 @@ def test_light_and_raw_pictures(command, photo):
     assert command("render", LENS, photo[0], *QUICK, *words, "-o", "raw.npy")[0] == 0
     camera = sensor(mosaic="RGGB", full_well=500)
     with torch.no_grad():
-        raw = rt.render(rt.read_lens(LENS), photo[1], sensor=camera, tol=0.3, model="gaussian").recorded(0).image
+        raw = rt.render(rt.read_lens(LENS), photo[1], sensor=camera, tol=0.3, model="gaussian").raw(0).image
     np.testing.assert_array_equal(np.load("raw.npy"), raw.numpy())
     code, _, err = command("render", LENS, photo[0], *QUICK, *words, "-o", "raw.png")
     assert code == 1

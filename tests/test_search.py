@@ -14,12 +14,15 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
+from raytrace.optimization.curriculum import Plan, Step
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
+from raytrace.optimization.one_element import thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.problem import NoProblem, conditions_of
-from raytrace.optimization.saddle_points import Place, enlarged, saddle, thinned
+from raytrace.optimization.removal import Removal, without_element
+from raytrace.optimization.saddle_points import Place, enlarged, saddle
 from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
     BadSearch,
@@ -219,7 +222,7 @@ def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
         rt.system.Row("MXCG", (1, 6), target=9.0, weight=1),
         rt.system.Row("EFFL"),
     )
-    numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
+    numbers = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, (3, 4), part)]  # noqa: E731
     others = [("MXCG", (1, 6), 9.0), ("EFFL", (0, 0), 0.0)]
     assert numbers(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
     assert numbers(0.5) == [*numbers(0), ("MNEG", (3, 4), 1.0)]
@@ -305,6 +308,136 @@ def test_from_a_triplet_to_better_lenses_of_four_elements():
     assert (four.merit < three.merit_after).all()
     assert float(four.merit[0]) < 0.65 * three.merit_after
     assert float(four.spots[0].max()) < 0.008
+
+
+# -- one element less --------------------------------------------------------------------------------------------------
+
+
+def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
+    asked, lens = best_triplet
+    removal = Removal(3, lens, asked)
+    stage = removal._stage(0.0)
+    x = np.clip(removal._whole.model.start, stage.lower, stage.upper)
+    thin, reduced = removal._whole.model.lens_at(x), removal.reduced
+    assert [surface.glass.name for surface in reduced.model.lens.surfaces].count("SK4") == 2
+    assert torch.allclose(rt.spot(without_element(thin, 3)).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
+    assert len(reduced.model.variables) == len(asked.model.variables) - 4
+    assert reduced.whole.merit(reduced.whole.evaluated(removal._without(x)), removal._without(x)) == pytest.approx(
+        stage.problem.merit(stage.problem.evaluated(x), x), rel=1e-9
+    )
+
+
+def test_the_stop_and_the_image_keep_their_places(best_triplet):
+    _, lens = best_triplet
+    assert (lens.stop, without_element(lens, 6).stop, without_element(lens, 1).stop) == (5, 5, 3)
+    for k in (1, 3, 6):
+        total = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
+        shorter = sum(float(surface.thickness) for surface in without_element(lens, k).surfaces[1:-1])
+        gone = sum(float(surface.thickness) for surface in lens.surfaces[1:3]) if k == 1 else 0.0
+        assert shorter == pytest.approx(total - gone, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_an_element_that_was_inserted_is_removed_again(best_triplet):
+    """Of four elements the removal of any, the best one of all, is at least as good as the triplet."""
+    asked, lens = best_triplet
+    how = {
+        "merit": asked.rows,
+        "vary": "curvature thickness",
+        "hold": "efl=100",
+        "bounds": "thickness:1..30 sensor:60..120",
+    }
+    three = rt.optimize(lens, **how)
+    four = rt.search(lens, insert=[4], **how)
+    again = rt.search(four.lens, delete=True, **how)
+    assert (again.stopped, again.starts) == ("surfaces", 4)
+    assert float(again.merit[0]) <= 1.001 * three.merit_after
+    assert len(again.lens.surfaces) == len(lens.surfaces)
+
+
+# -- minima of a loss --------------------------------------------------------------------------------------------------
+
+
+def mean_distance(points):
+    """A loss that is no sum of squares: the mean distance of rays from their centroid, mm."""
+    about = points - points.mean((-2, -1), keepdim=True)
+    return (about.square().sum(0) + 1e-12).sqrt().mean()
+
+
+def test_minima_of_the_merit_are_followed_to_minima_of_a_loss(tmp_path):
+    triplet = rt.read_lens("cooke_triplet").at(wavelengths=[0.5876])
+    how = {"merit": "spot", "vary": "curvature:1,2 sensor", "hold": "efl", "starts": 2, "seed": 1}
+    how["bounds"] = "sensor:60..90"
+    of_merit = rt.search(triplet, **how)
+    of_loss = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    quantity = rt.optimization.Points(8)  # by which the ends are checked
+    values = [float(mean_distance(quantity(lens))) for lens in of_loss.lenses]
+    assert of_loss.loss.tolist() == pytest.approx(values, rel=1e-9)
+    assert values == sorted(values)
+    assert values[0] < 0.999 * min(float(mean_distance(quantity(lens))) for lens in of_merit.lenses)
+    assert of_loss.focal_length.tolist() == pytest.approx(of_merit.focal_length.tolist(), rel=1e-6)
+    assert (of_loss.merit >= of_merit.merit.min() * (1 - 1e-6)).all()
+    again = rt.search(triplet, loss=mean_distance, of=rt.optimization.Points(4), folder=tmp_path, **how)
+    assert torch.equal(again.variables, of_loss.variables)
+    assert "loss" in str(of_loss)
+    with pytest.raises(NoProblem, match="as_built"):
+        rt.search(triplet, loss=mean_distance, as_built=rt.tolerancing.AsBuilt(grade="precision"), **how)
+
+
+# -- a curriculum ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def phone_plates():
+    return rt.read_lens("phone_plates")
+
+
+def test_a_step_has_its_part_of_aperture_and_field_and_its_terms(phone_plates):
+    plan = Plan("phone", phone_plates, None, None, "efl=6 chief_ray_angle<=30", None)
+    first = plan.problem(phone_plates, Step(0.4, 0.5, 4))
+    last = plan.problem(phone_plates, Step(1.0, 1.0, 9, ("conic", "a4"), 6))
+    assert float(rt.first_order(first.model.lens).entrance_pupil_diameter) == pytest.approx(0.4 * 3)
+    assert first.model.lens.fields.y.tolist() == pytest.approx([0, 5, 10, 15])
+    assert last.model.lens.fields.extent == pytest.approx(30)
+    assert len(last.model.variables) == len(first.model.variables) + 20
+    held = {condition.name: (condition.relation, condition.row.target) for condition in last.conditions}
+    assert held == {"efl": ("=", 6.0), "chief_ray_angle": ("<=", 30.0), "total_track": ("<=", 8.1), "bfd": (">=", 0.48)}
+    assert first.glass == pytest.approx((0.18, 0.96))
+
+
+@pytest.mark.parametrize(
+    ("lens", "hold", "said"),
+    [
+        ("phone_plates", None, "needs the focal length"),
+        ("folded_relay", "efl=6", "kind"),
+    ],
+)
+def test_a_curriculum_refuses_what_it_cannot_begin_with(lens, hold, said):
+    with pytest.raises(NoProblem, match=said):
+        rt.search(lens, kind="phone", hold=hold)
+
+
+def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
+    with pytest.raises(NoProblem, match="did you mean phone"):
+        rt.search(phone_plates, kind="fone", hold="efl=6")
+    with pytest.raises(NoProblem, match="exclude one another"):
+        rt.search(phone_plates, kind="phone", insert=True)
+
+
+@pytest.mark.slow
+def test_from_plates_to_a_phone_lens_that_is_as_sharp_between_its_fields(phone_plates, tmp_path):
+    result = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    lens = result.lens
+    assert result.stopped == "steps"
+    data = rt.first_order(lens)
+    assert float(data.effective_focal_length) == pytest.approx(6, rel=1e-6)
+    assert float(data.f_number) == pytest.approx(2, rel=1e-6)
+    dense = rt.spot(lens, fields=torch.linspace(0, 30, 61).tolist(), rings=20)
+    assert float(dense.whole.rms_radius.max()) < 0.004
+    assert float(result.between[0]) < 1.5
+    assert sum(float(surface.thickness) for surface in lens.surfaces[1:-1]) < 1.35 * 6 + 1e-6
+    again = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    assert torch.equal(again.variables, result.variables)
 
 
 # -- the journal -------------------------------------------------------------------------------------------------------
@@ -428,10 +561,17 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
         ),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
-        (["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"], "--starts goes without --insert"),
+        (
+            ["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"],
+            "--starts, --insert and --delete exclude one another",
+        ),
         (["--merit", "spot", "--vary", "curvature", "--insert", "3"], "surface 3 is none before the image"),
         (["--merit", "spot", "--vary", "curvature:1", "--insert", "2"], "has a curvature that does not vary"),
         (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
+        (["--merit", "spot", "--vary", "thickness", "--delete"], "no spherical element between air"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "2"], "begins no element"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "1"], "begins the element that is the stop"),
+        (["--merit", "spot", "--vary", "curvature", "--delete", "--insert"], "exclude one another"),
     ],
 )
 def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_path):

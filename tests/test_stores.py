@@ -246,7 +246,7 @@ def test_a_damaged_row_of_a_log_is_named_and_the_others_stay(row, tmp_path):
     with pytest.raises(DamagedRun, match=f"log.csv, line 3: .*'{row}', expected 2 numbers"):
         run.rows()
     with pytest.warns(DamagedLine, match=r"log.csv, line 3: .*; the line is dropped"):
-        run.forget_after(9)
+        run.drop_rows_from(9)
     assert run.rows() == [{"step": 0.0, "loss": 1.0}, {"step": 2.0, "loss": 3.0}]
 
 
@@ -320,7 +320,7 @@ def test_files_of_a_run_are_no_pipes(tmp_path):
         os.mkfifo(path)
     with pytest.raises(DamagedRun, match="is not a regular file"):
         run.load()
-    for read in (run.rows, lambda: run.forget_after(1)):
+    for read in (run.rows, lambda: run.drop_rows_from(1)):
         with pytest.raises(OSError, match="is not a regular file"):
             read()
 

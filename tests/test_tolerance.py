@@ -13,6 +13,7 @@ from problems import SHARED
 from scipy.optimize import minimize_scalar
 
 import raytrace as rt
+from raytrace.cli import main
 from raytrace.system.configurations import Operand
 from raytrace.tolerancing import monte_carlo
 from raytrace.tolerancing.criteria import criterion_of
@@ -251,12 +252,24 @@ def test_a_yield_that_is_met_leaves_the_limits(triplet):
 
 
 def test_impossible_goals_are_refused(triplet):
-    with pytest.raises(rt.BadTolerance, match=r"nominal lens .* not reach the goal"):
+    with pytest.raises(rt.BadTolerance, match=r"`goal` 1 µm: the nominal lens has .* not reach .*`yield_=0.9`"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, goal=1.0, yield_=0.9)
     with pytest.raises(ValueError, match="a share of the lenses between 0 and 1"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, yield_=90.0)
     with pytest.raises(ValueError, match=r"expected .* above 0"):
         rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.0)
+
+
+def test_a_goal_that_the_nominal_lens_misses_is_no_share_of_lenses(triplet, capsys):
+    with pytest.warns(rt.GoalMissed, match=r"`goal` 0.9 µm: the nominal lens has \d.*; a share .* `yield_=0.9`"):
+        built = rt.tolerance(triplet, limits="radius=0.1%", trials=0, goal=0.9)
+    assert built.summary()["yield_by_second_order"] == 0
+    for option, hint in {
+        "--goal": "a share of the lenses is --yield 0.9",
+        "--yield": "a share is written as 0.9",
+    }.items():
+        assert main(["tolerance", "cooke_triplet", option, "90%"]) == 2
+        assert hint in capsys.readouterr().err
 
 
 def test_second_order_of_each_limit(built):

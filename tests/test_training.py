@@ -84,8 +84,19 @@ def test_a_loss_that_is_no_number_stops_the_run_before_the_step(tmp_path):
     state = Run(tmp_path, {"rate": 1e-2}).load()
     assert state["step"] == 5
     assert all(bool(torch.isfinite(p).all()) for p in state["module"].values())
-    with pytest.raises(NotFinite, match="no checkpoint was made yet"):
+    with pytest.raises(NotFinite, match="the loss is nan; lower the learning rate; no checkpoint was written yet"):
         fit(tmp_path / "early", 20, poison=2)
+
+
+def test_a_gradient_that_is_not_finite_is_reported_as_such(tmp_path):
+    module = torch.nn.Linear(1, 1)
+
+    def root(step, share):
+        return torch.sqrt(0.0 * module.weight.sum()), {}
+
+    steps = train(module, torch.optim.SGD(module.parameters(), 0.1), root, steps=3, run=Run(tmp_path, {}))
+    with pytest.raises(NotFinite, match="step 0: a gradient is not finite; lower the learning rate"):
+        next(steps)
 
 
 def test_rates_follow_the_schedule_of_the_whole_run(tmp_path):

@@ -234,7 +234,7 @@ def test_bounds_are_read_by_name():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("sensor", "'sensor': expected a variable and its bounds, like thickness_5:8,12"),
+        ("sensor", "'sensor': expected a variable and its bounds, like thickness_5:8..12"),
         ("sensor:57", "'sensor:57': expected a variable and its bounds"),
         ("sensor:57,58,59", "'sensor:57,58,59': expected a variable and its bounds"),
         ("conic_1:-1,0 sensor:57,x", "'sensor:57,x': expected a variable and its bounds"),

@@ -11,7 +11,7 @@ import torch
 from scripts import script
 
 from raytrace.cli import wave_run
-from raytrace.cli.run import CommandError
+from raytrace.cli.runner import CommandError
 from raytrace.imaging.closed_form import camera_error
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, dead_leaves

@@ -10,7 +10,7 @@ from scripts import script
 
 from raytrace.cli import main, wave_run
 from raytrace.cli.commands import WAVE_COMMANDS as SUBCOMMANDS
-from raytrace.cli.run import CommandError
+from raytrace.cli.runner import CommandError
 from raytrace.imaging.pictures import dead_leaves
 
 table = script("wave_edof")

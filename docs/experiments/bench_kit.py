@@ -14,7 +14,7 @@ from pages import table, write_page
 
 from raytrace.bench.result import clock_name, machine
 from raytrace.cli.options import json
-from raytrace.cli.run import open_lens, present, printed_on_failure, say
+from raytrace.cli.runner import open_lens, present, printed_on_failure, say
 from raytrace.cli.settings import documents
 from raytrace.cli.types import count
 from raytrace.files import write_text

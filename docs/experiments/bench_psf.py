@@ -129,11 +129,11 @@ def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int = PIECE
     sampling = functools.partial(random, generator=generator)
     sizes = [min(piece, count - first) for first in range(0, count, piece)]
     parts = [drt.kernels_of_rays(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
-    centroid, covariance, kernel = (
+    centroid, covariance, kernel, arrived = (
         sum(size / count * values for size, values in zip(sizes, column, strict=True))
-        for column in zip(*((part.centroid, part.covariance, part.kernel) for part in parts), strict=True)
+        for column in zip(*((part.centroid, part.covariance, part.kernel, part.arrived) for part in parts), strict=True)
     )
-    return Kernels(kernel, grid, centroid, covariance, count)
+    return Kernels(kernel, grid, centroid, covariance, count, arrived)
 
 
 def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[Row]:

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from raytrace.bench.measure import Row, Tracer, field_rays, name_of, some, surfaces_of
 from raytrace.cli.progress import progress
-from raytrace.cli.run import say
+from raytrace.cli.runner import say
 from raytrace.io import read_lens
 from raytrace.maths.numerics import to
 from raytrace.system.lens import Lens, media

@@ -43,12 +43,21 @@ from raytrace.cli.codesign_run import (
     settings_of,
     train_run,
 )
-from raytrace.cli.run import CommandError, present, say
+from raytrace.cli.runner import CommandError, present, say
 from raytrace.cli.settings import documents, words
 from raytrace.cli.types import file_name, seed_number
 from raytrace.files import table
 from raytrace.imaging.closed_form import even_distances, scan
-from raytrace.imaging.codesign import OPTIMUM_COLUMNS, STEPS, Optimum, batch, camera, lens_at_start, outcome, usual
+from raytrace.imaging.codesign import (
+    OPTIMUM_COLUMNS,
+    STEPS,
+    Optimum,
+    batch,
+    camera,
+    default_settings,
+    lens_at_start,
+    outcome,
+)
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.maths.result import Result, plain
@@ -298,7 +307,7 @@ def compare(arguments: argparse.Namespace) -> None:
     steps = experiment.steps_per_epoch  # refuses pictures that do not fill a batch
     common = {name: value for name, value in dataclasses.asdict(settings).items() if name not in ("model", "seed")}
     # Refuses a folder of other settings, another lens or other pictures.
-    Run(study, {**common, **experiment.about}, usual=usual(settings))
+    Run(study, {**common, **experiment.about}, usual=default_settings(settings))
     rows, seeds = _rows_and_seeds(arguments, study)
     if not arguments.report_only:
         # Seeds outside: a study that is stopped has compared as many models as possible.

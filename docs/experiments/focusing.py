@@ -25,7 +25,7 @@ from torch import Tensor
 
 from raytrace.cli.options import json, plot
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError, present, refuse_suffix
+from raytrace.cli.runner import CommandError, present, refuse_suffix
 from raytrace.cli.settings import SEED, add_options
 from raytrace.cli.types import count, output_file
 from raytrace.cli.wave_options import camera, feature, light, pixels

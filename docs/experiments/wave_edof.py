@@ -27,7 +27,7 @@ from torch import Tensor
 from raytrace.cli import wave_design
 from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError, present, say
+from raytrace.cli.runner import CommandError, present, say
 from raytrace.cli.settings import add_options, defaults_of, documents, picture_options, picture_words, words
 from raytrace.cli.types import file_name
 from raytrace.cli.wave_design import LIMIT, PICTURES

@@ -32,7 +32,7 @@ from wave_edof import ROWS, STRENGTHS, contents_of, look, title_of
 
 from raytrace.cli.options import json, output_folder
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError, present
+from raytrace.cli.runner import CommandError, present
 from raytrace.cli.settings import (
     SEED,
     add_options,

@@ -34,10 +34,12 @@ from raytrace.system.lens import name_of_field
 from raytrace.tracing.scene import Scene, beam_share
 from raytrace.tracing.trace import is_bent
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
+from raytrace.words import with_options
 
 _PROBE = 10, 40
 _DEGREES = (14, 18, 22)  # tried in this order
 _MISSED = 1e-4  # waves that the polynomial may miss, at any of the rays that it is not fitted to
+_RAYS = "focus the lens, or use geometric rays, {geometric=True}"
 MARGIN = 1.06  # the square of directions reaches that much beyond the outermost ray of the probe
 
 
@@ -168,7 +170,7 @@ def exit_pupil(
         size = max(least, 64 * math.ceil(points_needed(beam) / 64))
     if size > _MOST:
         raise TooManyPoints(
-            f"the blur needs {size} points across the pupil, more than {_MOST}: focus the lens, or use geometric rays"
+            f"the blur needs {size} points across the pupil, more than {_MOST}: {with_options(_RAYS)}{_outside(scene)}"
         )
     normal = (probe.direction[:2] - middle[..., None]) / half[..., None]
     turn = _to_disc(normal.detach(), probe.usable) if is_bent(scene.lens) else None
@@ -223,15 +225,24 @@ def points_needed(beam: Beam) -> float:
     return 4 * float((beam.blur * beam.half.amax(0) * beam.waves_per).max().detach())
 
 
+def _outside(scene: Scene) -> str:
+    """The end of a message about a beam that is too wide: a field outside those of the lens, if there is one."""
+    fields = scene.lens.fields
+    largest, extent = float(torch.hypot(*scene.fields).amax()), float(fields.extent)
+    return (
+        f"; field {largest:.4g} {fields.unit} is outside the lens's, {extent:.4g}" if largest > 1.001 * extent else ""
+    )
+
+
 def _afford_time(scene: Scene, rays: int, seconds: float | None) -> None:
     """Raise TooManyPoints where a trace takes more than `seconds`; warn TakesLong of a long one without these."""
     aimed = 4 if scene.lens.ray_aiming == "real" else 1
     needed = rays * len(scene.lens.surfaces) * aimed * _SURFACE_SECONDS
     need = f"the blur needs a grid of {rays:,} rays"
     if seconds is None:
-        forewarn(needed, need, helps="use geometric rays")
+        forewarn(needed, need, helps="use geometric rays, {geometric=True}")
     elif needed > seconds:
-        raise TooManyPoints(f"{need}, {needed:.0f} s: focus the lens, or use geometric rays")
+        raise TooManyPoints(f"{need}, {needed:.0f} s: {with_options(_RAYS)}{_outside(scene)}")
 
 
 def _orders(degree: int) -> list[zernike.Order]:

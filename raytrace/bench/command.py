@@ -7,7 +7,7 @@ import torch
 
 from raytrace.bench import camera, psf, trace
 from raytrace.bench.result import Measured
-from raytrace.cli.run import CommandError, open_lens
+from raytrace.cli.runner import CommandError, open_lens
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
 

@@ -19,7 +19,7 @@ from raytrace.bench.measure import (
 )
 from raytrace.bench.result import Figure, Measured, Quantity, clock_name, curves, machine
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError
+from raytrace.cli.runner import CommandError
 from raytrace.maths.numerics import to
 from raytrace.maths.result import Column
 from raytrace.system.lens import Lens

@@ -5,8 +5,8 @@ only when the command runs, so that `raytrace --help` answers at once.
 
 - `commands`: the table of commands, each with its summary, examples and options; `options`: the table of options that
   several commands share; `types`: readers of their values.
-- `run`: the runner: opens the lens, calls the function, prints, saves; `progress`: bars.
-- `runs`, `render_run`: commands that do more.
+- `runner`: opens the lens, calls the function, prints, saves; `progress`: bars.
+- `runs`, `render_run`: functions of commands that do more.
 - `codesign`, `wave_…`, `settings`: co-design and phase elements, whose options are fields of settings.
 
 To add a command: a public function and a row of `COMMANDS`. To add an option: a parameter of the function and an
@@ -74,6 +74,11 @@ class _Parser(argparse.ArgumentParser):
             meant = "; figures are saved by --plot" if drawn else did_you_mean(name, known)
             meant = "; tables are saved by -o FILE.csv" if name == "--csv" and "-o" in known else meant
             self.error(f"unknown option {name}{meant}")
+        if unknown:
+            places = [action for action in self._actions if not action.option_strings]
+            takes = " ".join(f"{'one ' if action.nargs is None else ''}{action.metavar}" for action in places)
+            more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
+            self.error(f"unexpected {unknown[0]}{more}: the command takes {takes or 'options alone'}")
         return arguments, unknown
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
@@ -115,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             from raytrace.budget import within
             from raytrace.cli.progress import heartbeat
-            from raytrace.cli.run import carry_out
+            from raytrace.cli.runner import carry_out
 
             with heartbeat(arguments.command), within(getattr(arguments, "max_bytes", None)):
                 code = carry_out(arguments)

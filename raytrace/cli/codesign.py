@@ -31,7 +31,7 @@ torchrun --nproc-per-node 2 -m raytrace codesign …"""
 EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral -o learned.zmx
   raytrace codesign double_gauss --model gaussian --data pictures -o run --plot loss.png
-  raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o from_closed_form
+  raytrace codesign double_gauss --start spectral --bounds sensor:57..58 --data pictures -o from_closed_form
   raytrace codesign cooke_triplet --optimizer lm --vary curvature sensor --hold efl --field 0 8 12 --data pictures -o lm
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
@@ -43,11 +43,11 @@ EXAMPLES = """examples:
 
 #: The options by the field of `CodesignSettings`.
 ROWS = {
-    "model": option("PSF model of step 1", "MODEL", choices=MODELS),
+    "model": option("PSF model of step 1", "MODEL", choices=MODELS, type=str.lower),
     "vary": option(
         "variables: sensor (default), thickness:5,6 curvature:1-4; pickups curvature:6=-curvature:1", "WHAT", nargs="+"
     ),
-    "bounds": option("of variables: sensor:57.5,58 curvature_3:-0.04,0 (mm, 1/mm)", "NAME:LOW,HIGH", nargs="+"),
+    "bounds": option("of variables: sensor:57.5..58 curvature_3:-0.04..0 (mm, 1/mm)", "NAME:LOW..HIGH", nargs="+"),
     "hold": option(
         "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "
         "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step",

@@ -14,7 +14,7 @@ from torch import Tensor, distributed
 
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError, catalogs, find_lens, open_lens, present, say
+from raytrace.cli.runner import CommandError, catalogs, find_lens, open_lens, present, say
 from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
 from raytrace.imaging.codesign import (

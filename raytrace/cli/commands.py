@@ -37,6 +37,7 @@ from raytrace.cli.types import (
     count,
     count_or_all,
     count_or_none,
+    criterion_value,
     data_file,
     extent,
     file_name,
@@ -89,7 +90,11 @@ class Command:
                 command.add_to(children, command.name.removeprefix(f"{self.name}-"))
         elif with_options:
             add(parser, self.options)
-            flags = {action.dest: action.option_strings[-1] for action in parser._actions if action.option_strings}
+            flags = {
+                action.dest: action.option_strings[0 if isinstance(action, argparse.BooleanOptionalAction) else -1]
+                for action in parser._actions
+                if action.option_strings
+            }
             parser.set_defaults(run=self, flags=flags, suffix="")
 
 
@@ -282,10 +287,11 @@ COMMANDS = (
         "find the minima of a merit function globally, within bounds",
         "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
         "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
-        "optimised; the best are converged, and the search hops on from the best minima. --insert instead adds an "
-        "element: a thin meniscus at a surface is a saddle point that leads to new minima. --as-built orders the "
-        "minima by the merit with the expected spot of the manufactured lens, and lists both. -o stores every minimum "
-        "as a lens file, a table, figures and the state of the search: the same command resumes there bit-identically. "
+        "optimised; the best are converged, and the search hops on from the best minima. Instead --insert adds an "
+        "element, as a thin meniscus at a surface is a saddle point that leads to new minima, and --delete removes "
+        "each element in turn. --as-built orders the minima by the merit with the expected spot of the manufactured "
+        "lens, and lists both. -o stores every minimum as a lens file, a table, figures and the state of the search: "
+        "the same command resumes there bit-identically. "
         "Ctrl-C stops and keeps the minima found. Processes share the work: "
         "torchrun --nproc-per-node 2 -m raytrace search …",
         """
@@ -293,6 +299,8 @@ COMMANDS = (
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
         cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
+        double_gauss --merit spot --vary curvature thickness --hold efl=100 --edge 1 --delete -o fewer
+        phone_plates --kind phone --hold efl=6 -o phone
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
         *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
         group(
@@ -300,7 +308,11 @@ COMMANDS = (
             Option("starts", count, "N", "initial designs (default 64)"),
             Option("insert", count, "SURFACE", "instead of starts: insert a thin meniscus at every surface, or at "
                 "these", nargs="*"),
+            Option("delete", count, "SURFACE", "instead of starts: remove each element, or those of these first "
+                "surfaces, flattened and thinned while the rest follows", nargs="*"),
             "seconds",
+            Option("kind", None, "KIND", "phone: from plates of plastic to a wide and fast lens of aspheres, in steps",
+                choices=("phone",)),
             row("seed", "of starts and hops"),
         ),
         plot("the best lenses side by side"),
@@ -332,8 +344,8 @@ COMMANDS = (
         lens.zmx --of paths --field 0 10 -o derivatives.json
         double_gauss --vary curvature --of merit --merit spot""",
         *LENS, CONDITIONS, row("vary", "variables, pickups and solves (default: the file's)"),
-        Option("of", None, "QUANTITY", "'landing points' (default), directions, paths or merit",
-            choices=("landing points", "directions", "paths", "merit")),
+        Option("of", None, "QUANTITY", "points, where rays land on the image (default), directions, paths or merit",
+            choices=("points", "directions", "paths", "merit")),
         Option("merit", None, "KIND", "of --of merit: spot, wavefront or angular (default: the file's)"), TABLE,
         row("grade", "errors of manufacture by the tolerances of a published grade, as of `tolerance`"),
         row("limits", "errors by kind and limit, as of `tolerance`", default=""), "fields",
@@ -754,8 +766,8 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         row("seed", "seed of random numbers"),
         Option("increment", positive_finite, "CHANGE", "inverse sensitivity: limits are tightened until no error "
             "alone, at a limit, makes the criterion worse by more than this, in its unit"),
-        Option("goal", positive_finite, "VALUE", "largest criterion of a good lens, for an MTF the smallest; the share "
-            "of such lenses is reported"),
+        Option("goal", criterion_value, "VALUE", "value of the criterion that a good lens reaches, in its unit; alone "
+            "it reports the share of good lenses (yield), with --yield it tightens the limits"),
         Option("yield_", positive_finite, "SHARE", "a share of the lenses, 0.9 by default, whose criterion is "
             "reported; with --goal, limits are tightened at least total tightness until this share reaches the goal, "
             "by second order corrected by traced lenses", flag="--yield"),
@@ -763,7 +775,7 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         Option("arms", count, "N", "of the pupil, 4·rings by default"),
         Option("light_loss", positive_finite, "SHARE", "share of the light of the nominal lens that a lens may lose; "
             "a lens that loses more has failed", default=0.05),
-        Option("model", None, "MODEL", "PSFs of psf: gaussian (default), smooth in the errors, or drt",
+        Option("model", str.lower, "MODEL", "PSFs of psf: gaussian (default), smooth in the errors, or drt",
             choices=("gaussian", "drt"), default="gaussian"),
         row("pixel", "pixel pitch of psf (default 0.005)"),
         row("size", "pixels across the windows of psf (default 21)"),

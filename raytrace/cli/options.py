@@ -128,8 +128,8 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("pixel", positive_finite, "MM", "pixel pitch (default 0.005)"),
     Option("size", count, "N", "pixels across the windows (default 21)"),
     Option("tol", positive_finite, "T", "bound on the estimated error (default 0.01)"),
-    Option("model", None, "MODEL", "paraxial, fourier, gaussian, drt or wave, in order of fidelity; auto (default) "
-           "takes the first that agrees with the next", choices=("auto", *MODELS)),
+    Option("model", str.lower, "MODEL", "paraxial, fourier, gaussian, drt or wave, in order of fidelity; auto "
+           "(default) takes the first that agrees with the next", choices=("auto", *MODELS)),
     switch("plot_log", "draw brightness on a logarithmic scale of four decades", flag="--log"),
     # optimisation
     Option("seconds", positive_finite, "S", "time limit"),
@@ -244,7 +244,7 @@ MERIT: tuple[Adder, ...] = (
 FREEDOM = group(
     "variables and constraints, instead of the file's",
     "vary",
-    Option("bounds", None, "NAME:LOW,HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1,0), "
+    Option("bounds", None, "NAME:LOW..HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1..0), "
            "open on one side (sensor:30..)", nargs="+"),
     Option("hold", None, "NAME=VALUE", "constraints: efl=50 f_number=4 'total_track<=80' 'distortion<=2%' 'bfd>=30' "
            "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' efl@2=100, or an operand as "

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import raytrace
 from raytrace.cli.progress import Bar, Lines, progress
-from raytrace.cli.run import CommandError, open_lens, options_of, say
+from raytrace.cli.runner import CommandError, open_lens, options_of, say
 from raytrace.cli.types import OutputFolder
 from raytrace.imaging.image import linearised
 from raytrace.imaging.render import checked_depth, default_sensor
@@ -64,8 +64,8 @@ def render_files(arguments: argparse.Namespace) -> RenderedPictures:
                 rendering = raytrace.render(lens, load(), sensor=sensor, **options, progress=advance)
             else:
                 how = {"background": options.get("background"), "boundary": options["boundary"], "progress": advance}
-                rendering = rendering.another(load(), options["depth"], **how)
-            capture = rendering.recorded if arguments.raw else rendering.captured
+                rendering = rendering.with_picture(load(), options["depth"], **how)
+            capture = rendering.raw if arguments.raw else rendering.demosaiced
             recorded = capture(torch.tensor(number), arguments.seed)
         target = targets[number]
         if target is not None:

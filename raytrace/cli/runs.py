@@ -7,7 +7,7 @@ from pathlib import Path
 
 import raytrace
 from raytrace.cli.progress import Lines, progress, silence
-from raytrace.cli.run import (
+from raytrace.cli.runner import (
     CommandError,
     catalogs,
     find_lens,

@@ -127,6 +127,13 @@ def positive_finite(text: str) -> float:
     return positive(text)
 
 
+def criterion_value(text: str) -> float:
+    """A finite value above 0 of a criterion; a percentage is refused."""
+    if text.endswith("%"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no value of the criterion; a share of the lenses is --yield 0.9")
+    return positive_finite(text)
+
+
 def not_negative(text: str) -> float:
     """A finite number, 0 or more."""
     number = finite(text)
@@ -214,7 +221,8 @@ def _number(text: str) -> float:
     try:
         number = float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number (LENS goes before the options)") from None
+        hint = "; a share is written as 0.9" if text.endswith("%") else " (LENS goes before the options)"
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number{hint}") from None
     if number != number:
         raise argparse.ArgumentTypeError("nan is not a number to work with")
     return number

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.cli.pictures import pictures_of
 from raytrace.cli.progress import progress
-from raytrace.cli.run import CommandError, catalogs, say
+from raytrace.cli.runner import CommandError, catalogs, say
 from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera

@@ -9,6 +9,7 @@
 | sensor          | pixels and their field points, Bayer mosaic, capture; spectral_response: of its channels |
 | restoration     | linear filters (Wiener) and their errors in closed form                                 |
 | filters         | filters of a camera that follow from its current kernels                                |
+| lens_pictures   | pictures of small scenes by a lens, for losses of `rt.optimize`                         |
 | network         | RED-Net and a small U-Net                                                               |
 | pictures        | folders of photographs, dead-leaves images                                              |
 | training        | runs that resume                                                                        |

@@ -9,6 +9,7 @@ from raytrace.imaging.image import count_electrons as count_electrons
 from raytrace.imaging.image import depth_masks as depth_masks
 from raytrace.imaging.image import digitise as digitise
 from raytrace.imaging.image import transfer_functions as transfer_functions
+from raytrace.imaging.lens_pictures import LensPictures as LensPictures
 from raytrace.imaging.network import RedNet as RedNet
 from raytrace.imaging.network import UNet as UNet
 from raytrace.imaging.render import render as render

@@ -1,7 +1,8 @@
 """Co-design: a lens and a restoration network trained together, then the network refined on ray-traced PSFs.
 
 Step 1 ("joint") trains the variables of the lens and the network with one PSF model. Step 2 ("refine") freezes the lens
-and continues to train the network on ray-traced (DRT) PSFs, for as many epochs: a comparison of the lenses.
+and continues to train the network on ray-traced (DRT) PSFs for the same number of epochs, so that all lenses are
+compared with the same PSF model.
 
 Samples are keyed by their number: crop, object distance, noise and errors of manufacture are the same for all models of
 a seed.
@@ -58,9 +59,9 @@ from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of a sample's random numbers
 TEST_EPOCH = 2**20  # epoch of the test samples, which training never reaches
-_UNSEEN = 2**62  # number of the first perturbed camera of the test, of seed 0, which training never reaches
+_FIRST_TEST_TRIAL = 2**62  # trial number of the first perturbed test camera, of seed 0, which training never reaches
 STEPS = ("joint", "refine")
-PLACES = (0.0, 0.7, 1.0)  # of the test, as shares of the half diagonal of a sensor
+TEST_POSITIONS = (0.0, 0.7, 1.0)  # of the test patches, as shares of the half diagonal of a sensor
 LENS = "lens.zmx"  # of a run: the optimised lens
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
@@ -74,7 +75,10 @@ def lens_at_start(lens: Lens, settings: CodesignSettings) -> Lens:
     """
     wavelengths, weights = (lens.wavelengths.new_tensor(n) for n in (settings.wavelengths, settings.wavelength_weights))
     if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
-        raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
+        raise ValueError(
+            f"{len(weights)} wavelength_weights for {len(wavelengths)} wavelengths: give one weight ≥ 0 for each "
+            "wavelength, at least one above 0"
+        )
     lens = with_wavelengths(lens, wavelengths, weights)
     lens = lens.at(f_number=settings.f_number, ray_aiming=settings.ray_aiming)
     if settings.vignetting == "semi-diameters":  # at every surface but the stop, which the F/number sizes
@@ -110,7 +114,8 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
 
 
 def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor | None:
-    """Pupil points (2, P): `count` Sobol points, or hexapolar ones of the fewest rings with as many; None without."""
+    """Pupil points (2, P): `count` Sobol points, or hexapolar ones of the fewest rings with as many; None if no
+    count is specified."""
     if count is None:
         return None
     if sampling == "hexapolar":
@@ -122,7 +127,8 @@ def pupil_points(sampling: str, count: int | None, *, seed: int = 0) -> Tensor |
 
 
 def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> ToleranceTable | None:
-    """Tolerances of an experiment, of its grade and limits or of the file; None without. Raises BadTolerance."""
+    """Tolerances of an experiment, of its grade and limits or of the file; None if none are specified. Raises
+    BadTolerance."""
     if not settings.is_toleranced:
         return None
     if settings.refocus not in ("sensor", "none"):
@@ -133,9 +139,9 @@ def tolerances_at_start(lens: Lens, settings: CodesignSettings) -> ToleranceTabl
     )
 
 
-@functools.lru_cache(maxsize=8)  # every batch needs it, and its response may be read from a file
+@functools.lru_cache(maxsize=8)  # called for every batch; the response may be a file
 def sensor_at_start(settings: CodesignSettings) -> Sensor:
-    """The sensor of an experiment, of whole pixels; without a size a grey one of a patch, with white noise alone."""
+    """The sensor of an experiment; without `sensor` a monochrome sensor of one patch with Gaussian noise alone."""
     if not settings.sensor:
         side, count = settings.patch * settings.pixel, settings.patch
         return Sensor(size=(side, side), pixels=(count, count), read_noise=settings.noise, saturation=math.inf)
@@ -165,7 +171,7 @@ def network_at_start(settings: CodesignSettings) -> torch.nn.Module:
 
 
 def model_at(name: str, settings: CodesignSettings) -> Model:
-    """A PSF model with the numbers of an experiment: pupil points instead of `tol` where it has a number of rays."""
+    """PSF model of an experiment; a specified number of rays sets fixed pupil points, which replace `tol`."""
     rays = {"gaussian": settings.rays, "drt": settings.rays if settings.drt_rays is None else settings.drt_rays}
     if name == "paraxial":
         return Paraxial(rho=settings.rho)
@@ -198,7 +204,7 @@ def with_catalog_glasses(
 ) -> tuple[Camera[Variables], CodesignSettings]:
     """The camera with the nearest glasses of the catalogs, and the settings to train it again for `relearn` epochs.
 
-    Its variables are all but the numbers of glasses, at their current values; its network is the trained one. Raises
+    All variables except those of glasses remain, at their current values, and the network is the trained one. Raises
     BadVariables where no glass varies.
     """
     lens = trained.variables.snapped()
@@ -264,7 +270,8 @@ def batch(
 ) -> Batch:
     """The samples of an epoch with these numbers; object distances are uniform in z or in 1/z.
 
-    tolerances: of a perturbed lens for each sample, the trial of its number, counted over all epochs.
+    tolerances: each sample has its own perturbed lens, whose trial number is the number of the sample, counted over all
+    epochs.
     """
     size, parts = settings.patch + settings.size - 1, []
     for sample in samples:
@@ -298,7 +305,7 @@ def spectrum_of(pictures: Pictures, settings: CodesignSettings) -> Tensor:
     size = settings.patch + settings.size - 1
     joint = settings.filters == "joint"
     if joint and not settings.sensor:
-        raise ValueError("joint filters are those of the colours of a sensor: give sensor, as 24x16")
+        raise ValueError("filters 'joint' require a sensor with colours: set sensor, as 24x16")
     return patch_spectrum(pictures, size, crops=settings.crops, seed=settings.seed, joint=joint)
 
 
@@ -345,7 +352,7 @@ def absolute_error(camera: Camera, batch: Batch) -> Tensor:
 
 
 def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor]) -> list[Tensor]:
-    """Σ over pixels of measures of restored - picture, each (B,); of several channels their mean."""
+    """Sum over pixels of each measure of (restored - picture), (B,), averaged over channels."""
     batch = batch.to(camera.fields.device)
     difference = camera(batch.picture, batch.distance, **batch.capture) - camera.target(batch.picture)
     return [measure(difference).mean(-3).sum((-2, -1)) for measure in measures]
@@ -354,7 +361,7 @@ def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor])
 def optimise(
     camera: Camera[Variables], pictures: Pictures, settings: CodesignSettings, run: Run, *, every: int = 50
 ) -> Iterator[tuple[int, Record]]:
-    """The steps of one training, one at a time; variables of the lens that need no gradient are fixed."""
+    """The steps of one training, one at a time; lens variables with requires_grad=False stay fixed."""
     batches = Batches(pictures, settings, camera.tolerances if settings.as_built else None)
     pixels = settings.batch * settings.patch**2
     optics = [p for p in camera.variables.parameters() if p.requires_grad]
@@ -410,7 +417,7 @@ def held_out_error(
 
 
 def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
-    """Σ |filtered - picture| of every sample behind linear filters (C, rows, columns), (B,)."""
+    """Σ |filtered - picture| of every sample after linear filters (C, rows, columns), (B,)."""
     batch = batch.to(camera.fields.device)
     image = camera.image(batch.picture, batch.distance, batch.field, batch.errors, points=batch.points)
     recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
@@ -437,7 +444,7 @@ def errors_as_built(
     samples = batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
     if camera.tolerances is None:
         raise ValueError("errors as built of a camera without tolerances: give as_built, grade or limits")
-    drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_UNSEEN), []
+    drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_FIRST_TEST_TRIAL), []
     for number in progress(range(settings.cameras)):
         of_lens = dataclasses.replace(samples, errors=drawn[number])
         sums = _summed(camera, of_lens, lambda difference: difference.abs(), lambda difference: difference.square())
@@ -508,7 +515,7 @@ def run_model(
 
     def run(step: str) -> Run:  # raises OtherSettings
         document = {**dataclasses.asdict(settings), **about, "part": step}
-        return Run(folder / step, document, usual=usual(settings))
+        return Run(folder / step, document, usual=default_settings(settings))
 
     joint = run(STEPS[0])
     if (folder / "outcome.json").exists():
@@ -520,16 +527,16 @@ def run_model(
         course = to_closed_form(trained, settings, spectrum_of(train_pictures, settings))
         if course.no_optimum:
             warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
-    if is_second_order:  # the network is trained behind this lens
+    if is_second_order:  # the lens is fixed, only the network is trained
         trained.variables.requires_grad_(False)
     for step, record in optimise(trained, train_pictures, settings, joint):
         yield STEPS[0], step, record
     if settings.relearn:
         trained, again = with_catalog_glasses(trained, settings)
         trained.to(device)
-        done = settings.epochs * steps_per_epoch(train_pictures, settings)
+        steps_done = settings.epochs * steps_per_epoch(train_pictures, settings)
         for step, record in optimise(trained, train_pictures, again, run("glasses")):
-            yield STEPS[0], done + step, record
+            yield STEPS[0], steps_done + step, record
     l1_joint = held_out_error(trained, test_pictures, settings, progress=progress)
     freeze_lens(trained, settings)
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
@@ -541,8 +548,8 @@ def run_model(
         l1_as_built, psnr_as_built = errors_as_built(trained, test_pictures, settings, progress=progress)
     l1_by_place, wiener_by_place = {}, {}
     if settings.sensor:
-        filters = field_filters(trained, spectrum_of(train_pictures, settings), PLACES)
-        for place, filter in zip(PLACES, filters, strict=True):
+        filters = field_filters(trained, spectrum_of(train_pictures, settings), TEST_POSITIONS)
+        for place, filter in zip(TEST_POSITIONS, filters, strict=True):
             l1_by_place[f"{place:g}"] = tested(place=place)
             wiener_by_place[f"{place:g}"] = tested(place=place, filters=filter)
     result = Outcome(
@@ -576,7 +583,7 @@ def write_outcome(result: Outcome, folder: Path) -> None:
 
 
 def outcome(folder: Path) -> Outcome | None:
-    """The outcome of a finished run, None of an unfinished one."""
+    """The outcome of a finished run; None if it is unfinished."""
     path = Path(folder) / "outcome.json"
     if not path.exists():
         return None
@@ -585,7 +592,7 @@ def outcome(folder: Path) -> Outcome | None:
     return Outcome(**document | {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None})
 
 
-def usual(settings: CodesignSettings) -> dict:
+def default_settings(settings: CodesignSettings) -> dict:
     """The defaults of all settings, for folders of older versions without settings."""
     return {field.name: field.default for field in dataclasses.fields(settings)}
 
@@ -600,9 +607,9 @@ class Optimum:
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
     filter that is best for them; penalty: mm², violation of the limits, not part of the errors; focus: as for
     `Outcome`; no_optimum: the reason why this lens is no optimum, "" if it is one; downhill_mm: sensor distance of the
-    optimum downhill from the start, different from `sensor_mm` if that one is only local (`least_of_closed_form`).
-    course, penalties: error and penalty at every evaluation; at_end: variables at a bound beyond which the error still
-    falls.
+    minimum reached by descent from the start, which differs from `sensor_mm` if that minimum is only local
+    (`least_of_closed_form`). course, penalties: error and penalty at every evaluation; at_end: variables at a bound
+    beyond which the error still falls.
     """
 
     model: str
@@ -630,7 +637,7 @@ OPTIMUM_COLUMNS = tuple(field.name for field in dataclasses.fields(Optimum))[:9]
 
 def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spectrum: Tensor) -> Course:
     """Move the lens of a camera to an optimum of the closed form: by steps of second order for the optimizer "lm", else
-    to the one that `start` specifies: of its model, or of Gaussian DRT."""
+    to the optimum named by `start`: of the PSF model of the experiment, or of the Gaussian model."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
     first = camera(trained.variables.lens, dataclasses.replace(settings, model=model))
     distances = even_distances(first, spread=settings.spread)

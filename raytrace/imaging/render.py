@@ -53,7 +53,7 @@ from raytrace.materials.glass import OutOfRange
 from raytrace.maths.numerics import placed, varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, Figure, array, new_figure, styled
-from raytrace.psf_models import MODELS, NotConverged
+from raytrace.psf_models import MODELS, NotConverged, model_name
 from raytrace.psf_models.dft import TooManyPoints
 from raytrace.system.lens import Lens, check_media, field_points, is_round_about_axis, with_wavelengths
 from raytrace.tracing.f_number import axial_f_number
@@ -63,41 +63,40 @@ from raytrace.tracing.ray_failures import OutOfReach
 from raytrace.wave_optics.compute import COLOURS, DESIGN
 from raytrace.wave_optics.element import Element, in_contact
 from raytrace.wave_optics.hybrid import is_stop_alone, stop_alone
-from raytrace.words import RaytraceWarning, calling_level
+from raytrace.words import RaytraceWarning, calling_level, former_name, option
 
 #: A PSF model, its order and the pixels across its window.
-Rung: TypeAlias = tuple[str, int, int]
+ModelChoice: TypeAlias = tuple[str, int, int]
 
-_MOST_NODES = 65  # along the longer side
-_DEGREE = 13  # of the polynomials of the distortion of other lenses
-_FIT = 25  # places along a side at which these are fitted
-_LIT = 33  # radii at which the illumination of a round lens is computed
-_RADII = 257  # at which the chief rays of a round lens are traced
-_COARSE = 600  # pixels along the longer side, on which the flux is computed, in so many rounds
-_ROUNDS = 4
-_PLANES = 8
-_AZIMUTHS = 64  # at which the edge of the image circle of other lenses is searched
-_EDGE, _PARTS = 0.01, 20  # pixels, to which it is known; parts of a range that are searched at once
-_ABOUT = 1 / 400  # of the corner's distance, to which it is known where sensors are refused
-_BEYOND_FIELDS = 1.5  # image heights of the largest field, to the corners of a sensor
-_MOST_NUMBERS = 2**27  # of kernels there: about a minute for the blur of a picture of 240 × 160 pixels
-_SIZES = 12  # of sensors among which the largest is searched
-_FAINT = 1e-3  # relative illumination that counts as none: rays hardly find so narrow a beam
-_WAVELENGTHS = 6, 9, 13, 19, 28, 41  # over the response of a sensor
-_CELLS = 8  # between nodes, in whose middles the interpolation is checked
-_FIRST_NODES = 5  # along the longer side
-_WIDE = 12.0  # λN: rays that land farther from the chief ray are not compared with waves, a second a place and colour
-_BEYOND = 0.72  # λN over a pixel: Σ |h - ĥ| of a point without diffraction, in the middle of a pixel
-_COPIES = 6  # of the kernels and of the image, which are in memory together
+_FIRST_NODES, _MOST_NODES = 5, 65  # kernel nodes along the longer side of the sensor, at first and at most
+_DEGREE = 13  # degree of the distortion polynomial of a lens without rotational symmetry
+_FIT = 25  # points along a side at which this polynomial is fitted
+_LIT = 33  # radii at which the illumination of a rotationally symmetric lens is computed
+_RADII = 257  # radii at which the chief rays of a rotationally symmetric lens are traced
+_COARSE = 600  # pixels along the longer side on which the flux is computed
+_ROUNDS = 4  # iterations of the flux
+_PLANES = 8  # default number of layers of a depth map
+_AZIMUTHS = 64  # azimuths of the image circle of a lens without rotational symmetry
+_EDGE, _PARTS = 0.01, 20  # tolerance of the radius of the image circle, pixels; subdivisions of a refinement
+_ABOUT = 1 / 400  # the same tolerance where a sensor is refused, relative to the distance of its corner
+_BEYOND_FIELDS = 1.5  # accepted distance of the corners of a sensor over the image height of the largest field
+_MOST_NUMBERS = 2**27  # numbers of all kernels of such a sensor: about a minute for a picture of 240 × 160 pixels
+_SIZES = 12  # sizes of sensors among which the largest possible one is searched
+_FAINT = 1e-3  # relative illumination that is treated as 0: few rays pass so narrow a beam
+_WAVELENGTHS = 6, 9, 13, 19, 28, 41  # numbers of wavelengths over the response of a sensor
+_CELLS = 8  # cells between nodes in whose centres the interpolation is checked
+_WIDE = 12.0  # λN: larger blurs are not compared with the wave model, about 1 s a position and wavelength
+_BEYOND = 0.72  # Σ |h - ĥ| without diffraction of a point in the centre of a pixel, times the pixel pitch over λN
+_COPIES = 6  # copies of kernels and image held in memory together
 #: Shares of the tolerance: of the PSF model, of the wavelengths, of the interpolation between nodes and of low rank.
 _MODEL, _SPECTRUM, _BETWEEN, _LOW_RANK = 0.2, 0.1, 0.5, 0.2
-#: What the kernels of each PSF model leave out.
+#: Effects that each PSF model neglects.
 _NEGLECTED = {
     "paraxial": "aberrations and diffraction",
     "fourier": "aberrations",
-    "gaussian": "the shape of the blur, a Gaussian as wide, and diffraction",
+    "gaussian": "the shape of the blur (a Gaussian of equal variance) and diffraction",
     "drt": "diffraction",
-    "wave": "nothing of the wavefront",
+    "wave": "polarisation",
 }
 
 
@@ -110,13 +109,13 @@ class ImageFormation:
     """Image formation of a lens on a sensor, for any number of pictures: kernels, light and distortion, from `optics`.
 
     kernels: (m, n, D, C, h, w) at nodes from edge to edge of the sensor; flux: (D, C, H′, W′), light of every point of
-    a white scene, on larger pixels; illumination: (H, W) of its image, or None for 1; ideal: (2, H, W),
-    column and row of the picture that every pixel sees, or None without distortion; planes: (D,) 1/mm, reciprocal
-    distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| in the
-    middle of a cell, the mean over the cells; nan of requested nodes; model, order: of the PSF; reason: for the model;
-    wavelengths: (W,) µm; lit: (H, W), pixels at which a chief ray and light arrive, or None for all; sampling: pixels
-    of the picture in one of the sensor, along a side: these numbers are of the finer ones; haze: (D, C), of elements
-    alone, the light beyond the window of the kernels, which is spread evenly over the image, or None.
+    a white scene, on larger pixels; illumination: (H, W) relative illumination, None means 1; ideal: (2, H, W), column
+    and row of the picture imaged onto every pixel, None without distortion; planes: (D,) 1/mm, reciprocal object
+    distances of the kernels; error: estimated error of the kernels between the nodes, Σ |h - ĥ| at the centre of a
+    cell, mean over cells; nan of requested nodes; model, order: of the PSF; reason: for the model; wavelengths: (W,)
+    µm; lit: (H, W), pixels at which a chief ray and light arrive, None means all; sampling: picture pixels per sensor
+    pixel and side: all maps refer to picture pixels; haze: (D, C), of phase elements alone: the light outside the
+    window of the kernels, which is spread evenly over the image, or None.
     """
 
     sensor: Sensor
@@ -149,7 +148,10 @@ class ImageFormation:
         picture = checked_picture(picture, self.sensor, self.sampling)
         background = None if background is None else checked_picture(background, self.sensor, self.sampling)
         if depth is None and len(self.planes) > 1:
-            raise ValueError(f"kernels of {len(self.planes)} depths and no depth map: give depth")
+            raise ValueError(
+                f"kernels exist for {len(self.planes)} object distances: give `depth`, the distance (H, W) mm of each "
+                "pixel"
+            )
         depth = None if depth is None else checked_depth(depth, picture)
 
         def warped(part: Tensor) -> Tensor:
@@ -214,8 +216,8 @@ def sampling_of(picture: Tensor, sensor: Sensor) -> int:
     count = height // rows
     if (height, width) != (count * rows, count * columns) or not count:
         raise ValueError(
-            f"a picture of {width} × {height} pixels on a sensor of {columns} × {rows}: resize it, or give the sensor "
-            "its number of pixels, or that over a whole number, by which the scene is then sampled more finely"
+            f"picture {width} × {height} pixels, sensor {columns} × {rows} pixels: each side of the picture must be k "
+            f"times that of the sensor, k = 1, 2, …; resize the picture, or use Sensor(pixels=({width}, {height}))"
         )
     return count
 
@@ -228,7 +230,8 @@ def checked_picture(picture: Tensor, sensor: Sensor, sampling: int = 1) -> Tenso
     rows, columns = picture.shape[-2:]
     if sampling_of(picture, sensor) != sampling:
         raise ValueError(
-            f"a picture of {columns} × {rows} pixels for a lens prepared for {sampling} × {sampling} of them in a pixel"
+            f"a picture of {columns} × {rows} pixels; the kernels are prepared for {sampling} × {sampling} picture "
+            "pixels in a pixel of the sensor: resize the picture, or call `render` again"
         )
     if picture.shape[-3] not in (1, channels):
         raise ValueError(
@@ -237,7 +240,7 @@ def checked_picture(picture: Tensor, sensor: Sensor, sampling: int = 1) -> Tenso
         )
     if not bool(torch.isfinite(picture).all()):
         count = int((~torch.isfinite(picture)).sum())
-        raise ValueError(f"{count} numbers of the picture are not finite: expected light in every pixel")
+        raise ValueError(f"{count} numbers of the picture are not finite: expected finite values")
     return picture.expand(*picture.shape[:-3], channels, rows, columns)
 
 
@@ -285,10 +288,9 @@ def optics(
     if sampling > 1:
         columns, rows = sensor.pixels
         sensor = dataclasses.replace(sensor, pixels=(sampling * columns, sampling * rows), mosaic="none")
-    if model not in (None, *MODELS):
-        raise ValueError(f"model {model!r}: expected {', '.join(MODELS)}")
+    model = None if model is None else model_name(model)
     if order is not None and model is None and not elements:
-        raise ValueError(f"order {order} of no model: give model=…, one of {', '.join(MODELS)}")
+        raise ValueError(f"order {order} without a model: give model=…, one of {', '.join(MODELS)}")
     model = model or ("wave" if elements else None)
     check_model(model, elements)
     like = lens.surfaces[-2].thickness
@@ -304,8 +306,8 @@ def optics(
     response = sensor.response if wavelengths is None and len(lens.wavelengths) > 1 else None
     if not is_stop_alone(lens):
         few = lens if response is None else _at_wavelengths(lens, *band(response), _WAVELENGTHS[0])
-        about = partial(_image_circle, of_fields, sensor, like)
-        _check_reach(few, sensor, about, model, size, nodes, distances, lateral_colour, tol)
+        image_circle = partial(_image_circle, of_fields, sensor, like)
+        _check_reach(few, sensor, image_circle, model, size, nodes, distances, lateral_colour, tol)
     circle = None if is_stop_alone(lens) else _image_circle(of_fields, sensor, like)
     corners, diagonal = (_within(circle, places) for places in (_places(sensor, 5, 5, like), _diagonal(lens, sensor)))
     if response is not None and not is_stop_alone(lens):
@@ -352,7 +354,7 @@ def _check_reach(
 
     There the blur grows so fast that the tolerance needs the largest number of nodes. Raises WindowTooLarge or
     OverBudget, with the largest sensor of the same shape, where kernels of them as large as those of the corners cannot
-    be computed; image_circle: known to a number of mm.
+    be computed; image_circle: function of the tolerance of its radius, mm.
     """
     corner, height = float(torch.hypot(*sensor.corners).max()), _image_height(lens, sensor)
     if not height or corner <= _BEYOND_FIELDS * height:
@@ -363,11 +365,11 @@ def _check_reach(
         width, height = sensor.size
         part = dataclasses.replace(sensor, size=(share * width, share * height))
         corners = _within(circle, part.corners.to(lens.surfaces[-2].thickness))
-        about = lens, part, model or "gaussian", corners, distances
-        window = size or window_size(*about, lateral_colour=lateral_colour, tol=tol)
+        kernel_arguments = lens, part, model or "gaussian", corners, distances
+        window = size or window_size(*kernel_arguments, lateral_colour=lateral_colour, tol=tol)
         m, n = nodes or _nodes(part, _MOST_NODES)
         if len(distances) * len(weights) * m * n * window**2 > _MOST_NUMBERS:
-            raise OverBudget(f"kernels of {window} × {window} pixels at {m} × {n} places of the sensor take minutes")
+            raise OverBudget(f"kernels of {window} × {window} pixels at {m} × {n} positions of the sensor take minutes")
         _afford_kernels((m, n), len(distances), weights, window, part)
 
     place = (
@@ -388,11 +390,11 @@ def _check_reach(
         columns, rows = sensor.pixels
         raise type(error)(
             f"{place}, and the blur there is too large: take a sensor of at most about {sides} mm (--sensor) for "
-            f"{columns} × {rows} pixels, or give the lens larger fields; {error}"
+            f"{columns} × {rows} pixels, or give the lens larger fields, lens.at(fields=…); {error}"
         ) from None
     warnings.warn(
         f"{place}: the blur beyond that height may take minutes to compute; take a smaller sensor (--sensor), or give "
-        "the lens larger fields",
+        "the lens larger fields, lens.at(fields=…)",
         BeyondFields,
         stacklevel=calling_level(),
     )
@@ -405,7 +407,7 @@ def _image_height(lens: Lens, sensor: Sensor) -> float:
 
 
 def _diagonal(lens: Lens, sensor: Sensor) -> Tensor:
-    """Places (2, N) mm on the diagonal: on one half of it where the other is its image."""
+    """Points (2, N) mm on the diagonal, of a rotationally symmetric lens before a centred sensor on one half of it."""
     half = is_round_about_axis(lens) and not any(sensor.offset)
     shares = (0.0, 0.5, 1.0) if half else (-1.0, -0.5, 0.0, 0.5, 1.0)
     return sensor.on_diagonal(shares).to(lens.surfaces[-2].thickness)
@@ -426,7 +428,7 @@ def _over_response(
     The error of a number is the change of the channels' Gaussian kernels to about 1.5 times as many: of a shift d and a
     difference v of variance, Σ |h - ĥ| = √(2/π) d/σ + √(2/πe) v/σ². ends: of the response, µm. Warns NotConverged.
     """
-    sensor.weights(lens.wavelengths)  # a lens of another band is an error
+    sensor.weights(lens.wavelengths)  # raises if the wavelengths lie outside the response
     before = None
     for count in _WAVELENGTHS:
         sampled = _at_wavelengths(lens, *ends, count)
@@ -456,7 +458,7 @@ def _at_specified(lens: Lens, wavelengths: Tensor) -> Lens:
 
 
 def _at_wavelengths(lens: Lens, low: float, high: float, count: int) -> Lens:
-    """The lens at about so many equidistant wavelengths from low to high, µm, first the primary one."""
+    """The lens at about `count` equidistant wavelengths from low to high, µm, first the primary one."""
     step, primary = (high - low) / count, float(lens.primary)
     numbers = range(math.ceil((low - primary) / step), math.floor((high - primary) / step) + 1)
     wavelengths = [lens.primary]
@@ -484,38 +486,39 @@ def _model_of(
     tol: float,
     lateral_colour: bool,
     elements: tuple[Element, ...],
-) -> tuple[Rung, str]:
+) -> tuple[ModelChoice, str]:
     """Model, order and window of the kernels, and the reason for the model.
 
-    Without a model: the first one of the ladder of `psf_models` that traces rays whose kernels on the diagonal differ
-    from the next model's by less than the tolerance. Warns NotConverged where waves need too many rays.
+    Without a model: the first model of the sequence of `psf_models` that traces rays and whose kernels on the diagonal
+    differ from those of the next model by less than the tolerance. Warns NotConverged where waves need too many rays.
     """
 
-    def fitted(name: str) -> Rung:
+    def fitted(name: str) -> ModelChoice:
         window = size or window_size(
             lens, sensor, name, corners, distances, lateral_colour=lateral_colour, elements=elements, tol=tol
         )
         if order is not None:
             return name, order, window
-        about = lens, sensor, name, sensor.fields(lens, diagonal), distances, window, _MODEL * tol
-        return name, order_of(*about, elements=elements), window
+        kernel_arguments = lens, sensor, name, sensor.fields(lens, diagonal), distances, window, _MODEL * tol
+        return name, order_of(*kernel_arguments, elements=elements), window
 
     if model is not None:
         return fitted(model), ""
     ring = 1e-3 * float(lens.wavelengths.max() * axial_f_number(lens))  # λN
     airy, reason = 1.22 * ring, ""
-    chosen: Rung | None = None
+    chosen: ModelChoice | None = None
     before: Tensor | None = None
     with torch.no_grad():
-        for row in (row for row in MODELS.values() if row.is_rung and row.traces):
+        for row in (row for row in MODELS.values() if row.is_automatic and row.traces):
             try:
                 if row.waves and chosen and (reach := 0.5 * chosen[2] * sensor.pitch / ring) > _WIDE:
                     raise TooManyPoints(
-                        f"the rays reach {reach:.0f} λN from their middle, waves are tried up to {_WIDE:g}"
+                        f"the blur radius is {reach:.0f} λN, and the wave model is tried up to {_WIDE:g} λN: choose "
+                        f"{option('model', 'wave')}, or focus the lens"
                     )
-                rung = fitted(row.name)
-                kernels = field_kernels(lens, sensor, *rung, distances, weights, lateral_colour).at(diagonal)
-            except WindowTooLarge:  # the tails of a Gaussian, which rays and waves do not have
+                choice = fitted(row.name)
+                kernels = field_kernels(lens, sensor, *choice, distances, weights, lateral_colour).at(diagonal)
+            except WindowTooLarge:  # only the tails of a Gaussian exceed the window
                 if row.name != "gaussian":
                     raise
                 continue
@@ -524,23 +527,23 @@ def _model_of(
                     raise
                 # Of a point in the middle of a pixel: a circular pupil has 2/(π² R) of its light beyond R λN.
                 share = _BEYOND * ring / sensor.pitch
-                reason = f"{100 * share:.2g} % of the light of a point, or less"
+                reason = f"at most {100 * share:.2g} % of the energy of an image point"
                 if share > tol:
-                    message = f"{chosen[0]}: diffraction is left out, {reason}; {error}"
+                    message = f"the PSF model {chosen[0]} neglects diffraction, {reason}; {error}"
                     warnings.warn(message, NotConverged, stacklevel=calling_level())
                 return chosen, reason
             if chosen is not None and before is not None:
-                gap = _apart(kernels, before)
+                gap = _kernel_difference(kernels, before)
                 if gap <= tol and (row.waves or sensor.pitch > 4 * airy):
-                    return chosen, f"{row.name} differs by {gap:.1e} of the light"
-                reason = f"{chosen[0]} differs by {gap:.1e} of the light"
-            chosen, before = rung, kernels
+                    return chosen, f"kernels of {row.name} differ by {gap:.1e}, Σ|Δh|"
+                reason = f"kernels of {chosen[0]} differ by {gap:.1e}, Σ|Δh|"
+            chosen, before = choice, kernels
     assert chosen is not None  # of DRT, or it raised
     return chosen, reason
 
 
-def _apart(kernels: Tensor, others: Tensor) -> float:
-    """Largest Σ |h - ĥ| of kernels (..., h, w) in windows of any size with one middle."""
+def _kernel_difference(kernels: Tensor, others: Tensor) -> float:
+    """Largest Σ |h - ĥ| of kernels (..., h, w) in windows of any size with a common centre."""
     size = max(kernels.shape[-1], others.shape[-1])
     padded = [torch.nn.functional.pad(part, [(size - part.shape[-1]) // 2] * 4) for part in (kernels, others)]
     return float((padded[0] - padded[1]).abs().sum((-2, -1)).max())
@@ -550,23 +553,24 @@ def _afford_kernels(nodes: tuple[int, int], count: int, weights: Tensor, size: i
     """Raise OverBudget for kernels of `count` distances, or images, that memory does not hold."""
     (m, n), channels = nodes, len(weights)
     (columns, rows), each = sensor.pixels, _COPIES * weights.element_size()
-    what = f"kernels of {size} × {size} pixels at {m} × {n} places of the sensor need too much memory"
-    helps = "take a larger {tol} or a smaller {sensor}, or focus the lens ({size} sets their window)"
-    afford(each * channels * count * m * n * size * size, what, helps=helps)
-    what = f"{columns} × {rows} pixels of {channels} channels need too much memory"
-    afford(each * channels * columns * rows, what, helps="take a picture of fewer pixels")
+    problem = f"kernels of {size} × {size} pixels at {m} × {n} positions of the sensor need too much memory"
+    remedy = "take a larger {tol} or a smaller {sensor}, or focus the lens ({size} sets their window)"
+    afford(each * channels * count * m * n * size * size, problem, helps=remedy)
+    problem = f"{columns} × {rows} pixels of {channels} channels need too much memory"
+    afford(each * channels * columns * rows, problem, helps="take a picture of fewer pixels")
 
 
 def _image_circle(lens: Lens, sensor: Sensor, like: Tensor, edge: float | None = None) -> tuple[Tensor, Tensor] | None:
-    """Middle (2, 1) mm and radii (A,) mm of the image circle at equidistant azimuths, or None if it holds the sensor.
+    """Centre (2, 1) mm and radii (A,) mm of the image circle at equidistant azimuths, or None if it holds the sensor.
 
-    Outside no chief ray arrives, or no light. Of a round lens a single radius. edge: mm to which radii are known.
+    Outside the circle no chief ray or no light reaches the sensor. A rotationally symmetric lens has one radius. edge:
+    tolerance of the radii, mm.
     """
     edge = _EDGE * sensor.pitch if edge is None else edge
     with torch.no_grad(), warnings.catch_warnings():
-        round_ = is_round_about_axis(lens)
-        middle = like.new_zeros(2, 1) if round_ else sensor.landing(lens, like.new_zeros(2, 1)).nan_to_num(0.0)
-        angle = torch.arange(1 if round_ else _AZIMUTHS, dtype=like.dtype, device=like.device)
+        is_symmetric = is_round_about_axis(lens)
+        middle = like.new_zeros(2, 1) if is_symmetric else sensor.landing(lens, like.new_zeros(2, 1)).nan_to_num(0.0)
+        angle = torch.arange(1 if is_symmetric else _AZIMUTHS, dtype=like.dtype, device=like.device)
         angle = 2 * math.pi / len(angle) * angle
         ray = torch.stack([torch.sin(angle), torch.cos(angle)])
         inside, width = torch.zeros_like(angle), torch.hypot(*(sensor.corners.to(like) - middle)).max()
@@ -587,12 +591,12 @@ def _has_light(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
 
 
 def _radius(circle: tuple[Tensor, Tensor], points: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances (...) of points (2, ...) from the middle of an image circle, and its radius in their directions."""
+    """Distances (...) of points (2, ...) from the centre of an image circle, and its radius in their directions."""
     middle, radii_ = circle
     x, y = points - middle.reshape(2, *(1,) * (points.dim() - 1))
-    turns = torch.atan2(x, y) / (2 * math.pi) % 1 * len(radii_)
-    left = turns.floor().long() % len(radii_)
-    part = turns - turns.floor()
+    azimuth_index = torch.atan2(x, y) / (2 * math.pi) % 1 * len(radii_)
+    left = azimuth_index.floor().long() % len(radii_)
+    part = azimuth_index - azimuth_index.floor()
     return torch.hypot(x, y), (1 - part) * radii_[left] + part * radii_[(left + 1) % len(radii_)]
 
 
@@ -602,7 +606,7 @@ def _is_lit(circle: tuple[Tensor, Tensor], points: Tensor) -> Tensor:
 
 
 def _within(circle: tuple[Tensor, Tensor] | None, points: Tensor) -> Tensor:
-    """Points (2, ...) mm, those outside the image circle moved to its edge, towards its middle."""
+    """Points (2, ...) mm, those outside the image circle moved to its edge, towards its centre."""
     if circle is None:
         return points
     (distance, radius), middle = _radius(circle, points), circle[0].reshape(2, *(1,) * (points.dim() - 1))
@@ -636,7 +640,7 @@ def _grid(
 ) -> tuple[Tensor, float]:
     """Kernels (m, n, D, C, h, w) at as many nodes as the tolerance needs, and the error of their interpolation.
 
-    The error is that in the middle of a cell, where four kernels are averaged, the mean over 8 cells. Nodes
+    Error: Σ |h - ĥ| at the centre of a cell, ĥ the mean of the four kernels at its corners, mean over 8 cells. Nodes
     outside the image circle have the kernels of its edge. Raises OverBudget.
     """
     sensor = kernels.sensor
@@ -674,9 +678,9 @@ def _grid(
 def _flux(kernels: Tensor, illumination: Tensor | None, sensor: Sensor) -> Tensor:
     """Light v (D, C, H′, W′) of the points of a white scene, whose image is the relative illumination E.
 
-    Kernels that vary shift light from place to place: Σ_r′ h(r - r′; r′) is not 1 everywhere, but a white scene is as
-    bright as its exit pupil is large, whatever the aberrations. v: the fixed point of v + E - A v, A the blur, from E
-    on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
+    Kernels that vary over the field move light: Σ_r′ h(r - r′; r′) is not 1 everywhere, but the irradiance of a white
+    scene depends on the solid angle of the exit pupil alone, not on aberrations. v: the fixed point of v + E - A v, A
+    the blur, from E on; smooth, so that larger pixels, which kernels and E are averaged over, are enough.
     """
     if illumination is None and kernels.shape[:2] == (1, 1):
         return kernels.new_ones(*kernels.shape[2:4], 1, 1)
@@ -734,7 +738,7 @@ def illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
     arrives = ~fields.isnan().any(0)
     values = torch.zeros_like(fields[0, arrives])
     if len(values):
-        with suppress(OutOfReach):  # of all of them
+        with suppress(OutOfReach):  # every field is out of reach: illumination 0
             values = relative_illumination(lens, fields=fields[:, arrives]).illumination
     return placed(values.nan_to_num(0.0), arrives)
 
@@ -742,11 +746,11 @@ def illumination_at(lens: Lens, sensor: Sensor, points: Tensor) -> Tensor:
 def _ideal(
     lens: Lens, sensor: Sensor, circle: tuple[Tensor, Tensor] | None, pixels: Tensor | None, like: Tensor
 ) -> Tensor:
-    """Column and row (2, H, W) of the picture that every pixel sees: of the paraxial image of its object.
+    """Picture column and row (2, H, W) for each pixel: the paraxial image point of the object whose chief ray meets it.
 
-    Chief rays near the axis give the scale, on the sensor as it stands. Of a round lens, whose pixels are given,
-    linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays. Outside the image circle the
-    displacement is in proportion to the radius, or equal to the displacement at the edge.
+    Chief rays near the axis set the scale at the current sensor distance. Of a rotationally symmetric lens, whose
+    pixels are given, linear between 257 radii; else polynomials of degree 13 through 25 × 25 chief rays. Outside the
+    image circle the displacement is proportional to the radius, or equal to the displacement at the edge.
     """
     if pixels is not None:
         nodes = radii(pixels, _RADII)
@@ -818,10 +822,10 @@ def render(
     lens: or phase elements in contact without a lens, `sensor_distance` mm before the sensor, of an object at infinity
         or of `depth`.
     picture: (..., C, H, W), or (H, W), linear in light; integers of 8 or 16 bits are encoded as sRGB (IEC 61966-2-1).
-    sensor: of as many pixels as the picture, or of pixels that hold k × k of it, a scene sampled more finely; by
+    sensor: with the number of pixels of the picture, or 1/k of it along a side (a scene sampled more finely); by
         default of the size that the largest field of the lens fills to its corners, one channel, or "rgb" of three.
-    wavelengths: (W,) µm; of a sensor with a response by default as many over it as `tol` needs, else, and where the
-        lens has a single one, the lens's; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
+    wavelengths: (W,) µm. Default: of a sensor with a response, as many over it as `tol` requires; otherwise, or if the
+        lens has one wavelength, those of the lens; of elements 0.55, or 0.46, 0.55 and 0.64 of a sensor in colour.
     depth: (H, W) mm from surface 1 to the object in every pixel, inf allowed: layers from far to near at `planes`
         equally spaced reciprocal distances, of which near ones cover far ones; softness: of the transition between
         layers, a logistic function of so large a share of the difference of their reciprocal distances.
@@ -831,10 +835,11 @@ def render(
         `rt.wave_optics.phase_element`.
     model: of the PSF, see `rt.psf`; by default the first of "gaussian", "drt" and "wave" whose kernels differ from
         the next model's by less than `tol`; with elements "wave".
-    tol: bound on the estimated error of the kernels, the sum of |h - ĥ|, twice the error of a picture from 0 to 1.
+    tol: upper bound of the estimated error Σ |h - ĥ| of the kernels; a picture with values from 0 to 1 then errs by at
+        most half of it.
     size: pixels across their window, an odd number, by default as many as hold the light.
     boundary: the scene beyond the edge of the picture: "reflect", its mirror image, or "zero", black.
-    distortion, lateral_colour, illumination: False leaves it out.
+    distortion, lateral_colour, illumination: False ignores the effect.
     progress: called with the number of convolutions done since the last call, and their total.
     Raises ValueError for a picture, depth map or sensor that do not fit, WindowTooLarge for a blur of over 401 pixels,
     OverBudget for kernels that memory does not hold.
@@ -847,7 +852,7 @@ def render(
         elements, wavelengths_of_stop, wavelengths = lens, wavelengths, None
         lens = element_in_stop(elements, sensor, sensor_distance, wavelengths_of_stop)
     elif sensor_distance is not None:
-        raise ValueError("a lens has a sensor distance: give lens.at(sensor_distance=…)")
+        raise ValueError("sensor_distance applies to elements without a lens; use lens.at(sensor_distance=…)")
     sensor = default_sensor(lens, light) if sensor is None else sensor
     sampling, distances = sampling_of(light, sensor), None
     light = checked_picture(light, sensor, sampling)
@@ -855,7 +860,7 @@ def render(
         depth = checked_depth(depth, light)
         distances = 1 / plane_distances(depth.double(), planes)
     elif background is not None:
-        raise ValueError("a background without a depth map: give depth, which says what lies in front of it")
+        raise ValueError(f"{option('background')} requires {option('depth')}, distances of the objects before it")
     background = None if background is None else checked_picture(linearised(background), sensor, sampling)
     ready = optics(
         lens, sensor, elements=elements, model=model, wavelengths=wavelengths, object_distances=distances, tol=tol,
@@ -902,7 +907,7 @@ def render_patches(
     """Images (B, C, H - size + 1, W - size + 1) of patches (B, C, H, W) centred at points (2, B) mm: for training.
 
     Each patch has the kernel of its centre, and with `illumination` the relative illumination there; distortion and its
-    change over a patch are left out. size, order: of the window and of the PSF model, as of `kernels` and `order` of
+    change over a patch are neglected. size, order: of the window and of the PSF model, as of `kernels` and `order` of
     the `ImageFormation` of the initial lens by the same model. model: by default "gaussian"; elements: as for `render`,
     with the model "wave". object_distances: (B,) mm from surface 1
     to the object of each patch, or one of all, inf allowed; by default the lens's. Differentiable in the numbers
@@ -992,14 +997,14 @@ def default_sensor(
         return Sensor(size=size, pixels=(columns, rows), offset=offset, **others)
     reach = _image_height(lens, Sensor(size=(1.0, rows / columns), pixels=(columns, rows)))
     if not reach:
-        raise ValueError("the lens has no field off the axis, which would give the sensor a size: give a sensor")
+        raise ValueError(f"all fields are on the axis and give the sensor no size: give {option('sensor')}")
     pitch = 2 * reach / math.hypot(columns, rows)
     return Sensor(size=(columns * pitch, rows * pitch), pixels=(columns, rows), offset=offset, **others)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Rendering(Result):
-    """image: (..., C, H, W), light without noise, 1 where an ideal lens of the same aperture shows white on the axis.
+    """image: (..., C, H, W), noise-free irradiance; 1 = white on the axis with an ideal lens of the same aperture.
 
     picture: the same of the ideal lens; optics: the lens and its sensor, for more pictures: `optics(picture)`.
     `save` writes .png, .tif and .npy of a single image.
@@ -1010,7 +1015,7 @@ class Rendering(Result):
     lens: Lens
     optics: ImageFormation
 
-    def another(
+    def with_picture(
         self,
         picture: Tensor,
         depth: Tensor | None = None,
@@ -1025,17 +1030,21 @@ class Rendering(Result):
         image = ready(light, depth, **options)
         return dataclasses.replace(self, image=image, picture=binned(light, ready.sampling))
 
-    def recorded(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """The raw rendering (..., 1, H, W): with the noise, the quantisation and the Bayer mosaic of the sensor.
+    def raw(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """The rendering with the noise, the quantisation and the Bayer mosaic (..., 1, H, W) of the sensor.
 
         index, seed: of the noise, see `Sensor.capture`.
         """
         return dataclasses.replace(self, image=self.optics.sensor.capture(self.image, index, seed))
 
-    def captured(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
-        """The rendering as `recorded`, with the missing colours of the mosaic interpolated."""
-        recorded = self.recorded(index, seed)
-        return dataclasses.replace(recorded, image=self.optics.sensor.demosaic(recorded.image))
+    def demosaiced(self, index: Tensor | Sequence[int] | None = None, seed: int = 0) -> Self:
+        """The rendering as `raw`, with the missing colours of the mosaic interpolated (..., C, H, W)."""
+        raw = self.raw(index, seed)
+        return dataclasses.replace(raw, image=self.optics.sensor.demosaic(raw.image))
+
+    another = former_name("another", "with_picture")
+    recorded = former_name("recorded", "raw")
+    captured = former_name("captured", "demosaiced")
 
     def save(self, path: str | PathLike, bits: int = 8) -> None:
         """Write a single image of one or three channels.
@@ -1065,23 +1074,24 @@ class Rendering(Result):
             names = f"all channels at the single wavelength of the lens, {float(ready.wavelengths[0]):.4g} µm"
         lines = [
             f"{columns} × {rows} pixels of {1e3 * ready.sensor.pitch:.4g} µm, {names}",
-            f"kernels of {ready.kernels.shape[-1]} × {ready.kernels.shape[-2]} pixels at {m} × {n} places"
+            f"kernels of {ready.kernels.shape[-1]} × {ready.kernels.shape[-2]} pixels at {m} × {n} field positions"
             + (f" and {depths} depths" if depths > 1 else "")
             + (
                 f", {ready.sampling} × {ready.sampling} of these in a pixel of the sensor" if ready.sampling > 1 else ""
             ),
-            f"PSF model {ready.model}, {count} wavelength{'s' * (count > 1)}; left out: {_NEGLECTED[ready.model]}"
+            f"PSF model {ready.model}, {count} wavelength{'s' * (count > 1)}; neglected: {_NEGLECTED[ready.model]}"
             + (f" ({ready.reason})" if ready.reason else ""),
         ]
         if math.isfinite(ready.error):
-            lines.append(f"estimated error between the places {ready.error:.1e} of the light")
+            lines.append(f"estimated interpolation error between field positions {ready.error:.1e}, Σ|Δh|")
         if ready.haze is not None:
-            lines.append(f"light beyond the window, spread evenly: at most {100 * float(ready.haze.max()):.1f} %")
+            outside = 100 * float(ready.haze.detach().max())
+            lines.append(f"energy outside the PSF window, added as a uniform background: at most {outside:.1f} %")
         if ready.lit is not None:
             dark = 100 * (1 - float(ready.lit.double().mean()))
             lines.append(f"{dark:.1f} % of the sensor is outside the image circle, black")
         if (darkest := self._darkest()) is not None:
-            lines.append(f"illumination of the darkest pixel{self._inside()} {100 * darkest:.1f} % of the axis")
+            lines.append(f"minimum relative illumination{self._inside()} {100 * darkest:.1f} %")
         if ready.ideal is not None and max(ready.ideal.shape[-2:]) > 1:
             last, first = self._ends(ready.ideal)
             (column, row), ideal = last - first, ready.ideal[:, last[1], last[0]] - ready.ideal[:, first[1], first[0]]
@@ -1093,11 +1103,11 @@ class Rendering(Result):
         return "" if self.optics.lit is None else " inside the image circle"
 
     def _darkest(self) -> float | None:
-        """Relative illumination of the darkest pixel in the image circle; None if it is left out or all is dark."""
+        """Relative illumination of the darkest pixel in the image circle; None if it is ignored or all is dark."""
         ready = self.optics
         if ready.illumination is None or (ready.lit is not None and not bool(ready.lit.any())):
             return None
-        return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).min())
+        return float((ready.illumination if ready.lit is None else ready.illumination[ready.lit]).detach().min())
 
     def _ends(self, ideal: Tensor) -> np.ndarray:
         """Column and row (2, 2) of the last and the first pixel on the diagonal that light reaches."""

@@ -1,8 +1,8 @@
 """Training: steps of an optimiser that may be interrupted at any moment and resume bit-identically.
 
 A run is a folder: `settings.json`, `log.csv` (a row for each step) and `checkpoint.pt` (the last state, replaced as a
-whole). Random numbers of a step do not depend on earlier ones, so that a resumed run repeats the steps since its
-checkpoint bit by bit.
+whole). The random numbers of a step depend on the seed and the number of the step alone, so that a resumed run is
+bit-identical.
 
 Several processes (`raytrace.shards`) share every batch: each takes its samples, and gradients are summed over all of
 them. Only the first process writes.
@@ -28,14 +28,14 @@ from raytrace.tracing.compiled import prepare
 from raytrace.words import RaytraceError, calling_level
 
 _LOG = logging.getLogger(__name__)
-_MOST = 1 << 34  # bytes of a checkpoint
-_ANEW = "remove it to begin anew"
+_MAX_BYTES = 1 << 34  # size of a checkpoint
+_RESTART = "remove it to restart the training"
 
 #: Numbers of a step by the name of their column in the log.
 Record = dict[str, float]
 
 
-#: Factors of learning rates at a part (0 to 1) of the steps: functions of the step alone, so that runs resume.
+#: Factor of the learning rate as a function of the progress of the training (0 to 1), so that runs resume.
 SCHEDULES: dict[str, Callable[[float], float]] = {
     "constant": lambda part: 1.0,
     "linear": lambda part: 1 - part,
@@ -57,14 +57,14 @@ class DamagedRun(RaytraceError, ValueError):
 
 RUN = Kind(
     DamagedRun,
-    "remove the folder to begin anew",
+    "remove the folder to restart the training",
     OtherSettings,
     "{path} holds another run: {difference}; choose another folder",
 )
 
 
 def read_state(path: Path) -> dict:
-    """The contents of a file of `torch.save`, on the processor: tensors and plain values only, nothing is executed.
+    """The contents of a file of `torch.save`, on the processor: tensors and plain values; pickled code is not executed.
 
     The archive is checked before torch reads it: lengths of its entries and their checksums. Raises DamagedRun.
     """
@@ -78,17 +78,15 @@ def read_state(path: Path) -> dict:
                     raise Unfit(f"{wrong} does not match its checksum")
             state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
             if not isinstance(state, dict):
-                raise Unfit(f"it holds a {type(state).__name__}")
+                raise Unfit(f"it contains a {type(state).__name__}; expected a dict")
         except Exception as error:  # zipfile and torch raise errors of any class
-            raise Unfit(f"no checkpoint, or a damaged one ({_in_line(error) or type(error).__name__})") from error
+            raise Unfit(f"not a readable checkpoint ({_single_line(error) or type(error).__name__})") from error
         return state
 
     try:
-        return read_file(path, decode, DamagedRun, "remove it to begin anew", _MOST)
+        return read_file(path, decode, DamagedRun, _RESTART, _MAX_BYTES)
     except OSError as error:
-        raise DamagedRun(
-            f"{path}: no checkpoint, or a damaged one ({error.strerror}); remove it to begin anew"
-        ) from error
+        raise DamagedRun(f"{path}: not a readable checkpoint ({error.strerror}); {_RESTART}") from error
 
 
 def write_state(path: Path, state: dict) -> None:
@@ -101,20 +99,22 @@ def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.opti
     try:
         step = state["step"]
         if not isinstance(step, int) or step < 0:
-            raise TypeError(f"step {step!r}")
+            raise TypeError(f"step {step!r}: expected an integer ≥ 0")
         module.load_state_dict(state["module"])
         if optimizer is not None:
             optimizer.load_state_dict(state["optimizer"])
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
-        raise DamagedRun(f"{path}: not a checkpoint of this run ({_in_line(error)}); choose another folder") from error
+        raise DamagedRun(
+            f"{path}: not a checkpoint of this run ({_single_line(error)}); choose another folder"
+        ) from error
     return step
 
 
 class Run(Folder):
     """A folder of a training run.
 
-    settings: all inputs that determine the result, as JSON; a folder with others is refused with OtherSettings. usual:
-    defaults of settings that an older folder does not have.
+    settings: all inputs that determine the result, as JSON; a folder with others is refused with OtherSettings.
+    usual: defaults of settings that an older folder does not have.
     """
 
     def __init__(self, folder: str | Path, settings: Mapping, *, usual: Mapping = MappingProxyType({})):
@@ -132,13 +132,13 @@ class Run(Folder):
         """The log, a dict for every step. Raises DamagedRun."""
         return read_log(self.log) if self.log.exists() else []
 
-    def forget_after(self, step: int) -> None:
-        """Drop rows of the log from `step` on: those that an interrupted run wrote after its last checkpoint."""
+    def drop_rows_from(self, step: int) -> None:
+        """Drop the rows of the log from `step` on, which an interrupted run wrote after its last checkpoint."""
         if self.log.exists():
             log = Table(self.log)
             header, rows, damaged = log.scan(RUN.damaged, RUN.advice)
-            for words in damaged:
-                warnings.warn(f"{words}; the line is dropped", DamagedLine, stacklevel=calling_level())
+            for message in damaged:
+                warnings.warn(f"{message}; the line is dropped", DamagedLine, stacklevel=calling_level())
             log.begin(header or [], *(row for _, row in rows if row[0] < step))
 
     def append(self, rows: list[tuple[int, Record]]) -> None:
@@ -161,7 +161,7 @@ def read_json(path: Path) -> dict:
     return read_document(path, mapped(anything), RUN.damaged, RUN.advice)
 
 
-def _in_line(error: object) -> str:
+def _single_line(error: object) -> str:
     return " ".join(str(error).split())[:400]
 
 
@@ -178,21 +178,22 @@ def train(
     penalty: Callable[[], Tensor] | None = None,
     schedule: str | None = None,
 ) -> Iterator[tuple[int, Record]]:
-    """The remaining steps, each taken when its item is taken from the iterator: (step, record of the log).
+    """Iterator over the remaining steps: each `next()` performs one training step and yields (step, record of the log).
 
-    loss: (step, share of this process) -> its part of the loss of the batch, to be summed over processes, and numbers
-    for the log (of the first process); every, seconds: steps and time between checkpoints, whichever passes first;
-    after_step: for example a projection; penalty: minimised together with the loss, equal in all processes. It is added
-    for the gradient alone: the log has it in its own column. schedule: of the learning rates of the optimiser, one of
-    SCHEDULES; by default `loss` may set them.
+    loss: (step, share of this process) -> the share of this process of the loss of the batch, which is summed over
+    processes, and values for the log, which the first process alone writes. every, seconds: steps and time between
+    checkpoints, whichever passes first. after_step: called after each step of the optimiser, as to project variables
+    onto their bounds. penalty: added to the loss for the gradient, equal in all processes; the log has it in the column
+    `penalty`, not in `loss`. schedule: of the learning rates of the optimiser, one of SCHEDULES; by default `loss` may
+    set them.
     Raises NotFinite for a loss or a gradient that is not finite, before the step.
     """
-    prepare()  # numbers must not depend on the moment at which the trace is compiled
+    prepare()  # compiled first: results must not depend on the moment of compilation
     rates = [group["lr"] for group in optimizer.param_groups]  # before a checkpoint sets those of its step
-    state, mine, saved_at = run.load(), share(), time.monotonic()
+    state, process_share, saved_at = run.load(), share(), time.monotonic()
     step = 0 if state is None else load_state(module, state, run.checkpoint, optimizer)
-    if mine.rank == 0:
-        run.forget_after(step)
+    if process_share.rank == 0:
+        run.drop_rows_from(step)
     rows: list[tuple[int, Record]] = []
     parameters = [p for p in module.parameters() if p.requires_grad]
     while step < steps:
@@ -200,39 +201,41 @@ def train(
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * SCHEDULES[schedule](step / steps)
         optimizer.zero_grad(set_to_none=True)
-        value, record = loss(step, mine)
-        added = None if penalty is None else penalty()
-        # By one process: gradients are summed over processes.
-        whole = value if added is None or mine.rank else value + added.to(value.dtype)
-        if whole.requires_grad:
-            whole.backward()
-        summed = _sum_over_processes(parameters, value.detach())
-        if not math.isfinite(summed):
-            last = (
-                f"the last checkpoint is {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was made yet"
-            )
-            raise NotFinite(f"step {step}: the loss is {summed}, or its gradient is none; {last}")
+        value, record = loss(step, process_share)
+        penalty_value = None if penalty is None else penalty()
+        # Only the first process adds the penalty, because gradients are summed over processes.
+        objective = value if penalty_value is None or process_share.rank else value + penalty_value.to(value.dtype)
+        if objective.requires_grad:
+            objective.backward()
+        total_loss, has_gradient = _sum_over_processes(parameters, value.detach())
+        if not (has_gradient and math.isfinite(total_loss)):
+            problem = "a gradient is not finite" if math.isfinite(total_loss) else f"the loss is {total_loss}"
+            last = f"last checkpoint: {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was written yet"
+            raise NotFinite(f"step {step}: {problem}; lower the learning rate; {last}")
         optimizer.step()
         after_step()
-        record = {"loss": summed} | ({} if added is None else {"penalty": float(added.detach())}) | record
+        record = (
+            {"loss": total_loss}
+            | ({} if penalty_value is None else {"penalty": float(penalty_value.detach())})
+            | record
+        )
         rows.append((step, record))
         step += 1
         due = step % every == 0 or step == steps or time.monotonic() - saved_at >= seconds
-        if mine.rank == 0 and due:
-            # The log first: rows after a checkpoint are dropped on resuming, missing ones could not be restored.
+        if process_share.rank == 0 and due:
+            # The log before the checkpoint: a resumed run drops surplus rows and cannot restore missing ones.
             run.append(rows)
             run.save({"step": step, "module": module.state_dict(), "optimizer": optimizer.state_dict()})
-            _LOG.info("step %d of %d: loss %.6g", step, steps, summed)
+            _LOG.info("step %d of %d: loss %.6g", step, steps, total_loss)
             rows, saved_at = [], time.monotonic()
         yield step - 1, record
 
 
-def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> float:
-    """Sum gradients and the loss over processes; NaN if any gradient is not finite."""
+def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> tuple[float, bool]:
+    """Sum gradients and the loss over processes; returns the loss, and whether all gradients are finite."""
     if share().processes > 1:
         for parameter in parameters:
             # The sums are equal in all processes to the last bit, so that all take the same step.
             parameter.grad = total(torch.zeros_like(parameter) if parameter.grad is None else parameter.grad)
         value = total(value)
-    finite = all(bool(torch.isfinite(p.grad).all()) for p in parameters if p.grad is not None)
-    return float(value) if finite else math.nan
+    return float(value), all(bool(torch.isfinite(p.grad).all()) for p in parameters if p.grad is not None)

@@ -265,7 +265,7 @@ class Held:
 
 
 class Variables(Owned):
-    """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
+    """The variables of a lens as parameters: number = `Variable.start` + `Variable.unit` · parameter, 0 at the start.
 
     vary: variable syntax as of `optimize` (`optimization.variables`), as "sensor thickness:5,6 a4:3 temperature
         curvature:6=-curvature:1". Solves and pickups are those named here alone: the sensor stays where it is put even

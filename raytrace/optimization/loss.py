@@ -14,7 +14,7 @@ from raytrace.optimization.least_squares import Cycle, CycleStart, Descent, leas
 from raytrace.optimization.lifted import Lifted, descend
 from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem
-from raytrace.optimization.quantities import Quantity
+from raytrace.optimization.quantities import Quantity, of_configurations
 from raytrace.system.lens import Lens
 from raytrace.words import option
 
@@ -29,32 +29,47 @@ Watch: TypeAlias = Callable[[Cycle, np.ndarray], object]
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """A function () of a lens, or of a quantity of it at object distances (D,)."""
+    """A function () of a lens, or of a quantity of it at object distances (D,), in all its configurations.
+
+    check_rings: of the rays by which an end is checked, by default twice as many as those of the quantity.
+    """
 
     function: Callable[..., Tensor]
     quantity: Quantity | None = None
     object_distances: Tensor | None = None
+    check_rings: int | None = None
 
     @classmethod
     def of(
-        cls, function: Callable[..., Tensor], quantity: Quantity | None, object_distances: Sequence[float] | None
+        cls,
+        function: Callable[..., Tensor],
+        quantity: Quantity | None,
+        object_distances: Sequence[float] | None,
+        check_rings: int | None = None,
     ) -> "Loss":
-        """Raises NoProblem for distances of a function of the lens itself."""
+        """Raises NoProblem for distances or rings of a function of the lens itself."""
+        if quantity is None and check_rings is not None:
+            raise NoProblem(f"{option('check_rings')} goes with a quantity, as {option('of', 'points')}")
         if object_distances is None:
-            return cls(function, quantity)
+            return cls(function, quantity, check_rings=check_rings)
         if quantity is None:
             raise NoProblem(
                 f"{option('object_distances')} goes with a quantity, as {option('of', 'points')}: a function of the "
                 "lens moves the object itself, by lens.at(object_distance=…)"
             )
-        return cls(function, quantity, torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1))
+        distances = torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1)
+        return cls(function, quantity, distances, check_rings)
 
     def __call__(self, lens: Lens) -> Tensor:
-        return self.function(lens if self.quantity is None else self.quantity(lens, self.object_distances))
+        if self.quantity is None:
+            return self.function(lens)
+        return self.function(of_configurations(self.quantity, lens, self.object_distances))
 
     def denser(self) -> "Loss | None":
         """The loss of the same quantity by more rays; None of a function of the lens itself, which has its own."""
-        return None if self.quantity is None else dataclasses.replace(self, quantity=self.quantity.denser())
+        if self.quantity is None:
+            return None
+        return dataclasses.replace(self, quantity=self.quantity.denser(self.check_rings), check_rings=None)
 
 
 @value

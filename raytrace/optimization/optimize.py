@@ -61,6 +61,7 @@ def optimize(
     object_distances: Sequence[float] | None = None,
     first: str | Merit | DefaultMerit | Sequence[Row] | None = "spot",
     restarts: int = 2,
+    check_rings: int | None = None,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = None,
@@ -81,14 +82,16 @@ def optimize(
     "mtf"), rows, by default the file's; or any function of a lens that returns one number (), a loss without `first`
     and `restarts`. loss: a function of a quantity of the lens that returns one number () to minimise, by lifted least
     squares (`optimization.lifted`); of: the quantity, "points", "otf" or "kernels", its settings
-    (`optimization.quantities`), or "lens"; object_distances: (D,) mm at which the quantity of the one lens is taken;
-    first: rows that are minimised first, whose boundaries are met exactly; None for none; restarts: descents from
-    lenses displaced at random by a part of the width of their spots. The end is judged by denser rays (`Optimized`).
-    vary: variables, or their syntax, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
-    "thickness:2,15"; hold: constraints met exactly, as "efl=50 total_track<=80" (`optimization.problem`). as_built:
-    `AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit. cycles,
-    seconds: limits, by default 500 cycles a path; paths: damping strategies to try. catalog: shipped catalogs or
-    AGF files for variable glasses, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
+    (`optimization.quantities`, `imaging.LensPictures`), or "lens"; object_distances: (D,) mm at which the quantity of
+    the one lens is taken, in each of its configurations; first: rows that are minimised first, whose boundaries are met
+    exactly; None for none; restarts: descents from lenses displaced at random by a part of the width of their spots.
+    The end is judged by denser rays (`Optimized`), of check_rings rings, by default twice as many.
+    vary: variables, or their syntax, as "curvature thickness:5,6" (surfaces 5 and 6), by default the file's; bounds: of
+    variables, as "thickness:2..15" (mm); hold: constraints met exactly, as "efl=50 total_track<=80"
+    (`optimization.problem`). as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens
+    as a term of the merit. cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
+    catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
+    (`optimization.glass_choice`). log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
     lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
     rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
@@ -173,7 +176,7 @@ def optimize(
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
     if loss is not None:
-        measured = Loss.of(loss, quantity, object_distances)
+        measured = Loss.of(loss, quantity, object_distances, check_rings)
         descents = LossDescents(
             problem, measured, lower=lower, upper=upper, typical=typical, evaluated=resumed.evaluated
         )  # fmt: skip

@@ -7,7 +7,7 @@ quantity is sampled by as many rays as its settings say, so that the loss is smo
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,12 +26,23 @@ _DENSER = 2  # times as many rings
 
 @runtime_checkable
 class Quantity(Protocol):
-    """A quantity of a lens at object distances (D,) mm; D = 1, its own one, without any."""
+    """A quantity of a lens at object distances (D,) mm; D = 1, its own one, without any.
+
+    distance_axis: the axis of D.
+    """
+
+    distance_axis: ClassVar[int]
 
     def __call__(self, lens: Lens, object_distances: Tensor | None) -> Tensor: ...
 
-    def denser(self) -> Self:
-        """The same quantity by more rays."""
+    def denser(self, rings: int | None = None) -> Self:
+        """The same quantity by more rays: of so many rings, or twice as many."""
+
+
+def of_configurations(quantity: Quantity, lens: Lens, object_distances: Tensor | None) -> Tensor:
+    """A quantity of every configuration of a lens, one after the other along the axis of object distances."""
+    each = [quantity(view, object_distances) for view in lens.configurations]
+    return each[0] if len(each) == 1 else torch.cat(each, quantity.distance_axis)
 
 
 def _at_distances(lens: Lens, object_distances: Tensor | None) -> list[Lens]:
@@ -50,6 +61,8 @@ class Points:
 
     rings: int = 8
 
+    distance_axis: ClassVar[int] = 1
+
     def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
         pupil, _ = equal_rings(self.rings)
         fields = field_points(None, like=lens)
@@ -57,8 +70,8 @@ class Points:
         traced = [image_rays(moved, pupil, fields=fields) for moved in lenses]
         return torch.stack([torch.where(rays.valid, rays.position[:2], torch.nan) for rays in traced], 1)
 
-    def denser(self) -> "Points":
-        return Points(_DENSER * self.rings)
+    def denser(self, rings: int | None = None) -> "Points":
+        return Points(rings or _DENSER * self.rings)
 
 
 @value
@@ -72,27 +85,32 @@ class Otf:
     frequencies: Sequence[float] = (10.0, 20.0, 40.0, 80.0)
     rings: int = 8
 
+    distance_axis: ClassVar[int] = 0
+
     def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
         points = Points(self.rings)(lens, object_distances)
         about = (points - points.mean((-2, -1), keepdim=True)).flip(0).movedim(0, -2)  # (D, F, W, 2, P), y first
         phase = -2 * np.pi * about[..., None, :] * about.new_tensor(self.frequencies)[:, None]
         return torch.polar(torch.ones_like(phase), phase).mean(-1)
 
-    def denser(self) -> "Otf":
-        return dataclasses.replace(self, rings=_DENSER * self.rings)
+    def denser(self, rings: int | None = None) -> "Otf":
+        return dataclasses.replace(self, rings=rings or _DENSER * self.rings)
 
 
 @value
 class Kernels:
     """PSFs (D, F, W, pixels, pixels) on pixels about the chief ray, of energy 1 for all light of a wavelength.
 
-    model: "gaussian" or "drt"; pixel: mm; order: of the model, as of `psf`, fixed for a loss that is smooth.
+    model: "gaussian" or "drt"; pixel: mm; order: of the model, as of `psf`, fixed for a loss that is smooth; it takes
+    the place of rings.
     """
 
     model: str = "gaussian"
     pixel: float = 0.005
     pixels: int = 31
     order: int = 5
+
+    distance_axis: ClassVar[int] = 0
 
     def __call__(self, lens: Lens, object_distances: Tensor | None = None) -> Tensor:
         kernels = psf(
@@ -101,8 +119,8 @@ class Kernels:
         ).kernel  # fmt: skip
         return kernels.reshape(-1, *kernels.shape[-4:])
 
-    def denser(self) -> "Kernels":
-        return dataclasses.replace(self, order=_DENSER * self.order)
+    def denser(self, rings: int | None = None) -> "Kernels":
+        return dataclasses.replace(self, order=rings or _DENSER * self.order)
 
 
 #: Quantities by the name of `of`.
@@ -117,6 +135,8 @@ def quantity_of(word: "str | Quantity") -> Quantity | None:
         raise TypeError(f"{option('of')} is {named_value(word)}; expected a name, or a quantity as Points(rings=12)")
     if word == "lens":
         return None
+    if word == "pictures":
+        raise ValueError(f"{option('of', word)}: of which scenes? Give of=rt.imaging.LensPictures(scenes)")
     if word not in QUANTITIES:
         known = ("lens", *QUANTITIES)
         raise ValueError(f"{option('of')} {word!r}: expected {', '.join(known)}{did_you_mean(word, known)}")

@@ -16,24 +16,20 @@ Source: Bociort & van Turnhout, Generating saddle points in the merit function l
 Opt. Express 17, 2009.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import null_space
 
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, SumOfSquares
-from raytrace.optimization.operands.boundaries import BOUNDARIES
-from raytrace.optimization.operands.table import OPERANDS
+from raytrace.optimization.one_element import Move, conditions_renumbered, renumbered, thinned
 from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
-    Journal,
-    Minima,
-    Minimum,
     SearchProblem,
     Stage,
     TaskResult,
@@ -41,12 +37,11 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 from raytrace.words import option
 
-_SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 _NEAR = 0.01  # relative change of the residuals by a step along a variable, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
@@ -90,7 +85,7 @@ def _objection(free: DesignVariables, k: int) -> str:
 
 def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
-    made, free = with_meniscus(lens, k), task.model
+    made, free, behind = with_meniscus(lens, k), task.model, partial(_behind, k=k)
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
     old = [replace(variable, surface=_behind(variable.surface, k)) for variable in free.variables]
     bounds = {variable: (least, most) for variable, least, most in zip(old, *task.bounds, strict=True)}
@@ -100,29 +95,20 @@ def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
     solves = tuple(_moved(solve, k) for solve in free.solves)
     if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
-        merit, kept = tuple(_row(row, k) for row in data.merit), tuple(_moved(solve, k) for solve in data.kept)
+        merit, kept = renumbered(data.merit, behind), tuple(_moved(solve, k) for solve in data.kept)
         diameters = tuple(_behind(surface, k) for surface in data.semi_diameters)
         data = replace(data, variables=variables, solves=solves, merit=merit, semi_diameters=diameters, kept=kept)
         made = replace(made, optimization_data=replace(data, tolerances=()))
     return replace(
         task,
         model=DesignVariables(made, variables, solves),
-        rows=tuple(_row(row, k) for row in task.rows),
-        conditions=tuple(replace(condition, row=_row(condition.row, k)) for condition in task.conditions),
+        rows=renumbered(task.rows, behind),
+        conditions=conditions_renumbered(task.conditions, behind),
         bounds=(
             np.array([bounds[variable][0] for variable in variables], dtype=float),
             np.array([bounds[variable][1] for variable in variables], dtype=float),
         ),
     )
-
-
-def thinned(rows: Sequence[Row], k: int, part: float) -> tuple[Row, ...]:
-    """The rows with a part of the least thicknesses of the new gaps, without them if `part` is 0.
-
-    Rows that are split off come last.
-    """
-    pieces = [_split(row, k, part) if part < 1 else [row] for row in rows]
-    return (*(piece[0] for piece in pieces), *(row for piece in pieces for row in piece[1:]))
 
 
 def with_meniscus(lens: Lens, k: int) -> Lens:
@@ -142,29 +128,6 @@ def _behind(surface: int, k: int) -> int:
 
 def _moved(solve: Solve, k: int) -> Solve:
     return replace(solve, surface=_behind(solve.surface, k), source=_behind(solve.source, k))
-
-
-def _row(row: Row, k: int) -> Row:
-    """A row that names the same surfaces by their new numbers."""
-    if row.operand in BOUNDARIES:
-        kinds = ("surface", "surface" if row.operand[:2] in ("MN", "MX") else "")
-    else:
-        kinds = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    first, second = (_behind(n, k) if kind in _SURFACES else n for kind, n in zip(kinds, row.integers, strict=True))
-    return replace(row, integers=(first, second)) if any(kinds) else row
-
-
-def _split(row: Row, k: int, part: float) -> list[Row]:
-    """A row of least thicknesses as several: of the gaps of old, and with part of its target of the new ones."""
-    first, last = row.integers
-    is_least = row.operand in BOUNDARIES and row.operand[:2] == "MN" and row.operand[-1] in "TGA"
-    if not is_least or last < k or first > k + 1:
-        return [row]
-    ranges = [(first, k - 1), (max(first, k + 2), last)]
-    rows = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
-    if part > 0:
-        rows.append(replace(row, integers=(k, k + 1), target=part * row.target))
-    return rows or [replace(row, weight=0.0)]
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------
@@ -245,16 +208,8 @@ class Place:
         )
         lower = np.where(gaps, part * space.lower, space.lower)
         upper = np.where(gaps & (part == 0), 0.0, space.upper)
-        problem = self.task.problem(thinned(self.task.rows, self.k, part))
+        problem = self.task.problem(thinned(self.task.rows, (self.k, self.k + 1), part))
         return Stage(problem, cycles, options, lower, upper)
-
-    @property
-    def family(self) -> tuple:
-        """Media, stop and variables: minima of lenses with the same ones can be compared."""
-        lens = self.task.model.lens
-        variables = tuple(variable.address for variable in self.task.model.variables)
-        media = tuple((surface.glass.name, *surface.glass.coefficients.tolist()) for surface in lens.surfaces)
-        return media, lens.stop, variables
 
     def gone(self, sign: float, until: float = np.inf) -> TaskResult:
         """The minimum on one side of the saddle, of a lens of real thickness. Raises SearchStopped."""
@@ -296,64 +251,13 @@ class Place:
         return x
 
 
-@dataclass
-class Insertion:
-    """The search from a lens, over menisci at some of its surfaces."""
+def insertions(task: SearchProblem, places: Sequence[int]) -> Callable[[Lens], Iterator[Move]]:
+    """The moves from a minimum of a search problem: a meniscus at each surface, and the descents on both sides."""
 
-    task: SearchProblem
-    journal: Journal
-    places: Sequence[int]
-    families: dict[tuple, tuple[Problem, Minima]] = field(default_factory=dict)
-    started: int = 0  # descents
+    def moves(lens: Lens) -> Iterator[Move]:
+        for k in places:
+            place = Place(k, enlarged(lens, task, k))
+            descents = [(f"surface {k}, {side}", partial(place.gone, sign)) for side, sign in SIDES.items()]
+            yield Move(place.task, descents)
 
-    DONE: ClassVar[str] = "surfaces"
-
-    @property
-    def followed(self) -> int:
-        """Descents that were followed to their end."""
-        return self.started
-
-    def through(self, progress: Callable | None) -> None:
-        """The lens itself, then both sides at every place. Raises SearchStopped and NoProblem."""
-        model, space = self.task.model, self.task.space
-        stage = Stage(self.task.whole, LONG, FOLLOW, space.lower, space.upper)
-        until = self.journal.until
-        of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
-        if not of_lens.is_valid:
-            raise NoProblem(
-                f"{option('insert')}: the lens itself loses rays or violates {option('hold')}; search without insert "
-                "first"
-            )
-        lens, work = model.lens_at(of_lens.x), of_lens.seconds
-        bar = None if progress is None else progress(len(self.places) * len(SIDES), "descent")
-        try:
-            for k in self.places:
-                work += self._both(Place(k, enlarged(lens, self.task, k)), work, bar)
-        finally:
-            if bar is not None:
-                bar.close()
-
-    def _both(self, place: Place, work: float, bar: Any) -> float:
-        """The two sides of a saddle; the seconds that they took."""
-        tasks = [
-            (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))
-            for side, sign in SIDES.items()
-        ]
-        space = place.task.space
-        ends = self.journal.each(tasks, len(space.lower))
-        ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.families.setdefault(place.family, (place.task.whole, Minima(ranges)))
-        for (key, _), end in zip(tasks, ends, strict=True):
-            work += end.seconds
-            minima.add(end, key, work)
-            self.started += 1
-            if bar is not None:
-                bar.update(1)
-                each = self.each()
-                bar.set_postfix_str(f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else "")
-        return sum(end.seconds for end in ends)
-
-    def each(self) -> list[tuple[Problem, Minimum]]:
-        """All minima, the best first, each with its problem."""
-        minima = [(problem, minimum) for problem, distinct in self.families.values() for minimum in distinct.each]
-        return sorted(minima, key=lambda pair: pair[1].result.merit)
+    return moves

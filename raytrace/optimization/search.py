@@ -25,12 +25,15 @@ from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.optimization.attained import conditions_attained
 from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.contradictions import refuse_contradictions
+from raytrace.optimization.curriculum import Growth, Plan
 from raytrace.optimization.least_squares import SolverOptions
+from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
+from raytrace.optimization.one_element import FromLens
 from raytrace.optimization.opening import opened
 from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
@@ -41,8 +44,11 @@ from raytrace.optimization.problem import (
     Problem,
     conditions_in_unit,
     optimization_data_of,
+    typical_of,
 )
-from raytrace.optimization.saddle_points import Insertion, surfaces_of
+from raytrace.optimization.quantities import Quantity, quantity_of
+from raytrace.optimization.removal import elements_of, removals
+from raytrace.optimization.saddle_points import SIDES, insertions, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -73,7 +79,8 @@ if TYPE_CHECKING:
 #: Why a search ends.
 STOPPED = {
     "starts": "all starts were tried",
-    "surfaces": "both sides of every surface",
+    "surfaces": "all moves from the lens were followed",
+    "steps": "all steps were taken",
     "seconds": "the limit on time was reached",
     "interrupted": "interrupted; these were found so far",
 }
@@ -92,7 +99,8 @@ class Searched(Result):
     seconds until the first; tasks: key of that one. variables: (M, n). starts, descents: numbers of starts, and of
     descents that were followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are
     ordered, nan where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of
-    the refocused lens without errors; tolerances: of which errors.
+    the refocused lens without errors; tolerances: of which errors. loss: (M,), by which the minima are ordered, nan of
+    those that were not followed to a minimum of the loss.
     """
 
     before: Lens
@@ -112,6 +120,7 @@ class Searched(Result):
     stopped: str
     as_built: Tensor | None = None
     tolerances: str = ""
+    loss: Tensor | None = None
 
     @property
     def found(self) -> Tensor:
@@ -127,7 +136,8 @@ class Searched(Result):
         fields = {f"rms_{f}_um": 1e3 * self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
         variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
         number = torch.arange(1, len(self.lenses) + 1)
-        of_lens = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields, "between": self.between}
+        of_lens = {"minimum": number, **({} if self.loss is None else {"loss": self.loss}), "merit": self.merit}
+        of_lens |= {"efl": self.focal_length, **fields, "between": self.between}
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             of_lens |= {"merit_as_built": merit, "expected_um": 1e3 * expected, "refocused_um": 1e3 * nominal}
@@ -153,7 +163,8 @@ class Searched(Result):
             for name in columns
             if name.startswith("rms_")
         }
-        shown = {Column("minimum"): columns["minimum"], Column("merit"): self.merit}
+        of_loss = {} if self.loss is None else {Column("loss"): self.loss}
+        shown = {Column("minimum"): columns["minimum"], **of_loss, Column("merit"): self.merit}
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
@@ -205,22 +216,24 @@ class Searched(Result):
 
 def searched(
     lens: Lens,
-    each: Sequence[tuple[Problem, Minimum]],
+    each: Sequence[tuple[SearchProblem, Minimum]],
     *,
+    losses: Sequence[float] = (),
     starts: int,
     descents: int,
     stopped: str,
     seconds: float,
     as_built: ExpectationSettings | None = None,
 ) -> Searched:
-    """The result: minima, the best first, each with its problem."""
+    """The result: minima, the best first, each with its problem, and their losses."""
     terms: list[tuple[float, float, float]] = []
     if as_built is not None:
-        terms = [_as_built(problem, minimum, as_built) for problem, minimum in each[:MOST]]
+        terms = [_as_built(task.whole, minimum, as_built) for task, minimum in each[:MOST]]
         order = sorted(range(len(terms)), key=lambda k: (np.isnan(terms[k][0]), terms[k][0]))
         each, terms = [each[k] for k in order], [terms[k] for k in order]
     minima, lenses, tables = each[:MOST], [], []
-    for k, (problem, minimum) in enumerate(minima, 1):
+    for k, (task, minimum) in enumerate(minima, 1):
+        problem = task.whole
         variables = zip(problem.model.variables, minimum.result.x, strict=True)
         lenses.append(_design(problem, minimum.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
         tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
@@ -233,6 +246,7 @@ def searched(
         tasks=tuple(minimum.task for _, minimum in minima),
         variables=tensor([[table.get(name, np.nan) for name in names] for table in tables]),
         merit=tensor([minimum.result.merit for _, minimum in minima]),
+        loss=tensor(losses[:MOST]) if losses else None,
         focal_length=torch.stack(
             [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
         ),
@@ -327,6 +341,7 @@ _SHORT = 10, 12  # cycles on the narrow and on the whole beam
 _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
+_BY_LOSS = 8  # minima that are followed to minima of a loss
 _REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
 _DAMPED = SolverOptions(damping=0.1, bends=False)
 
@@ -336,15 +351,20 @@ _DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.valu
 def search(
     lens: Lens,
     *,
+    kind: str | None = None,
     merit: str | Merit | DefaultMerit | Sequence[Row] | None = None,
     vary: str | Sequence[str] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str] | Sequence[Condition] | None = None,
     starts: int | None = None,
     insert: bool | Sequence[int] | None = None,
+    delete: bool | Sequence[int] | None = None,
     seconds: float | None = None,
     seed: int = 0,
     as_built: ExpectationSettings | None = None,
+    loss: Callable[..., Tensor] | None = None,
+    of: str | Quantity = "points",
+    object_distances: Sequence[float] | None = None,
     folder: str | PathLike | None = None,
     progress: Callable | None = None,
     share: Share | None = None,
@@ -352,49 +372,70 @@ def search(
     """The distinct minima of a merit function globally, within bounds; the lens is one of the starts.
 
     merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
-    which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
+    which is that of `hold`, of a row EFFL or of the lens. starts: how many. Instead of starts, insert: True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
-    more (`saddle_points.py`). seconds: after which it ends; seed: of the draws. as_built: `AsBuilt`, the expected mean
-    square spot of the manufactured lens: the minima are those of the merit function alone, in the order of the merit
-    with this term; of each lens with the tolerances of its own surfaces. folder: keeps the minima as lens
-    files, a table and figures, and the journal: called again the search resumes, with the same result as without the
-    interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all descents is written there.
+    more (`saddle_points.py`); or delete: True, or first surfaces of elements, each of which is flattened and thinned
+    until it is gone, to lenses with one element less (`removal.py`). kind: "phone", a curriculum from plates of plastic
+    to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its focal
+    length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
+    as_built: `AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of the merit
+    function alone, in the order of the merit with this term; of each lens with the tolerances of its own surfaces.
+    loss, of, object_distances: as for `optimize`; the eight best minima are followed to minima of the loss, between the
+    same bounds and under the same conditions, and these are the result, in its order; merit and spots are those there.
+    folder: keeps the minima as lens files, a table and figures, and the journal: called again the search resumes, with
+    the same result as without the interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all
+    descents is written there.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch, BadTolerance.
     """
     if as_built is not None:
         as_built.of(lens)  # raises BadTolerance before the search
     if folder is not None:
         check_output_folder(folder)
+    measured = None if loss is None else Loss.of(loss, quantity_of(of), object_distances)
+    if measured is not None and as_built is not None:
+        raise NoProblem(f"{option('as_built')} orders minima by a merit of rows: leave it or {option('loss')} out")
     prepare()
     warn_of_filling(lens, field_points(None, like=lens))
     started = time.monotonic()
-    function = merit_for(lens, merit)
-    free = design_variables(lens, vary)
-    if any(variable.quantity == "glass" for variable in free.variables):
+    until = started + (np.inf if seconds is None else seconds)
+    given = [asked for asked in (kind, insert, delete) if asked is not None and asked is not False]
+    if len(given) + (starts is not None and kind is None) > 1:
+        raise NoProblem(
+            f"{option('starts')}, {option('insert')}, {option('delete')} and {option('kind')} exclude one another, but "
+            f"for {option('starts')} of {option('kind')}"
+        )
+    plan = None
+    if kind is not None:
+        plan = Plan(kind, lens, vary, bounds, hold, merit if isinstance(merit, DefaultMerit) else None)
+        task = plan.problem(lens, plan.curriculum.steps[0])
+        starts = plan.curriculum.starts if starts is None else starts
+    else:
+        function, free = merit_for(lens, merit), design_variables(lens, vary)
+        ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
+        glass, air = function.boundaries.glass, function.boundaries.air
+        task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
+    if any(variable.quantity == "glass" for variable in task.model.variables):
         raise NoProblem(
             f"{option('vary', 'glass')} is for optimize: search with the glasses as they are, then optimize what is "
             "found"
         )
-    glass, air = function.boundaries.glass, function.boundaries.air
-    ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
-    task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
-    until = started + (np.inf if seconds is None else seconds)
-    surfaces: tuple[int, ...] = ()
-    if insert is not None and insert is not False:
-        if starts is not None:
-            raise NoProblem(
-                f"{option('starts')} goes without {option('insert')}, which begins at the lens alone, on both sides "
-                "of every surface"
-            )
-        surfaces = surfaces_of(free, () if insert is True else tuple(insert))
-    if conditions:
+    if task.conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
-    run: Insertion | _Run
-    if surfaces:
-        run = Insertion(task, Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until), surfaces)
+    run: FromLens | Growth | _Run
+    if insert is not None and insert is not False:
+        surfaces = surfaces_of(task.model, () if insert is True else tuple(insert))
+        journal = Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until)
+        run = FromLens(task, journal, insertions(task, surfaces), len(SIDES) * len(surfaces), "insert")
+    elif delete is not None and delete is not False:
+        elements = elements_of(task.model, task.conditions, () if delete is True else tuple(delete))
+        journal = Journal(folder, {**task.about(seed), "delete": list(elements)}, until)
+        run = FromLens(task, journal, removals(task, elements), len(elements), "delete")
     else:
-        run = _Run(task, Journal(folder, task.about(seed), until), seed, STARTS if starts is None else starts)
+        about = task.about(seed) if plan is None else {**task.about(seed), "kind": kind}
+        journal = Journal(folder, about, until)
+        first = _Run(task, journal, seed, STARTS if starts is None else starts)
+        run = first if plan is None else Growth(plan, first, journal)
     stopped = run.DONE
     try:
         run.through(progress)
@@ -404,8 +445,13 @@ def search(
         stopped = "interrupted"
     if not (each := run.each()):
         raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None)
+    losses: list[float] = []
+    if measured is not None:
+        each, losses = _followed_by_loss(each, measured, run.journal, progress)
+        if stopped == run.DONE and np.isnan(losses).any():
+            stopped = "seconds" if time.monotonic() > until else "interrupted"
     result = searched(
-        lens, each, starts=run.started, descents=run.followed, stopped=stopped,
+        lens, each, losses=losses, starts=run.started, descents=run.followed, stopped=stopped,
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
     warn_of_worse([gap for gap in between(result.lens) if gap.is_worse])
@@ -415,6 +461,51 @@ def search(
         except (OSError, LensFileError) as error:
             warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=calling_level())
     return result
+
+
+def _followed_by_loss(
+    each: Sequence[tuple[SearchProblem, Minimum]], loss: Loss, journal: Journal, progress: Callable | None
+) -> tuple[list[tuple[SearchProblem, Minimum]], list[float]]:
+    """The best minima at the minima of a loss that lie below them, and their losses, in its order; then the others."""
+    name = getattr(loss.function, "__qualname__", type(loss.function).__name__)
+    key = f"loss {name} of {loss.quantity} at {plain(loss.object_distances)}"
+
+    def minimised(task: SearchProblem, x: np.ndarray) -> TaskResult:
+        begun, space = time.process_time(), task.space
+        descents = LossDescents(
+            task.whole, loss, lower=space.lower, upper=space.upper, typical=typical_of(task.model)
+        )  # fmt: skip
+        try:
+            end = descents.run(
+                x, first=False, restarts=0, cycles=None, until=journal.until, watch=lambda cycle, x: None
+            )  # fmt: skip
+        except NoProblem:  # rays of the loss fail
+            return TaskResult(np.inf, np.inf, np.inf, time.process_time() - begun, x)
+        if end.stopped in ("interrupted", "seconds"):
+            raise SearchStopped
+        missed = float(task.whole.state(end.x, False).missed.max(initial=0.0))
+        value = end.report.checked if np.isfinite(end.report.checked) else end.report.end
+        return TaskResult(0.0, missed, value, time.process_time() - begun, end.x)
+
+    ends: list[tuple[float, SearchProblem, Minimum]] = []
+    bar = None if progress is None else progress(min(len(each), _BY_LOSS), "descent")
+    try:
+        for task, minimum in each[:_BY_LOSS]:
+            x = minimum.result.x
+            (end,) = journal.each([(f"{minimum.task}, {key}", partial(minimised, task, x))], len(x))
+            merit = task.whole.merit(task.whole.evaluated(end.x), end.x)
+            ends.append((end.merit, task, replace(minimum, result=end._replace(merit=merit))))
+            if bar is not None:
+                bar.update(1)
+    except (SearchStopped, KeyboardInterrupt):
+        _LOG.info("the descents of the loss are not complete")
+    finally:
+        if bar is not None:
+            bar.close()
+    ends.sort(key=lambda end: end[0])
+    rest = list(each[len(ends) :]) if len(ends) < min(len(each), _BY_LOSS) else []
+    losses = [loss for loss, _, _ in ends] + [np.nan] * len(rest)
+    return [(task, minimum) for _, task, minimum in ends] + rest, losses
 
 
 @dataclass
@@ -442,9 +533,9 @@ class _Run:
         self.bounds = self.space.lower, self.space.upper
         self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _reversal(self.space))
 
-    def each(self) -> list[tuple[Problem, Minimum]]:
+    def each(self) -> list[tuple[SearchProblem, Minimum]]:
         """All minima, the best first, each with its problem."""
-        return [(self.whole, minimum) for minimum in self.minima.each]
+        return [(self.task, minimum) for minimum in self.minima.each]
 
     def through(self, progress: Callable | None) -> None:
         """Run all batches. Raises SearchStopped."""

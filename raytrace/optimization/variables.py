@@ -10,7 +10,7 @@ index glass:2                 the index of all glasses, as model glasses; a glas
 thickness:6@2                 in configuration 2, of a number that differs between configurations
 curvature:4=-curvature:3      pickup: a factor times another number plus an offset, as thickness:8=2*thickness:2+1
 curvature:7=f_number(4)       solve, a row of SOLVED_BY
-thickness:2..15 sensor:57,58  bounds, of `bounds_of`; an open end is left out
+thickness:2..15 sensor:57..58 bounds, of `bounds_of`; an open end is left out
 efl=50 total_track<=80        constraints, split by `constraint_words`; "efl" alone keeps the number of the lens
 
 `design_variables` makes the `DesignVariables` of a lens of them (`optimization.lens_state`).
@@ -205,7 +205,7 @@ def bounds_of(
     variables: Sequence[Vary],
     bounds: str | Sequence[str] | Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest value (n,) of the variables, by words as "thickness:2..15 curvature_3:-0.1,0", or by name.
+    """Smallest and largest value (n,) of the variables, by words as "thickness:2..15 curvature_3:-0.1..0", or by name.
 
     A name means all variables of a kind, one of a surface (thickness_3, or thickness:3-5 of several), or one in a
     configuration (thickness_3@2); later names override earlier ones. Raises BadVariables for a name of no variable.

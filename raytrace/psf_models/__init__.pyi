@@ -3,6 +3,7 @@ from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import MODELS as MODELS
 from raytrace.psf_models.models import Execution as Execution
 from raytrace.psf_models.models import NotConverged as NotConverged
+from raytrace.psf_models.models import model_name as model_name
 from raytrace.psf_models.models import model_of as model_of
 from raytrace.psf_models.models import name_of as name_of
 from raytrace.psf_models.models import psf as psf

@@ -5,7 +5,6 @@ million waves of piston lose no precision.
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -19,15 +18,11 @@ from raytrace.maths.sampling import Grid, centres, gauss_rings
 from raytrace.maths.tangents import applied
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.scene import Scene
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning
 
 
 class TooManyPoints(RaytraceError, ValueError):
     """A wave whose phase varies too much over the pupil to be summed."""
-
-
-class EmptyPupil(RaytraceError, ValueError):
-    """No light passes the pupil: a point spread function normalised by its light is undefined."""
 
 
 class Aliased(RaytraceWarning):
@@ -56,28 +51,6 @@ def huygens(
     # Each term is reduced to a fraction of a wave by itself: neither costs precision of the other.
     waves = _fraction(path / wavelength) + _fraction(torch.sign(radius) * excess / wavelength)
     return phasor(waves) @ amplitude.to(phasor(waves[:1, :1]).dtype)
-
-
-def fft_psf(amplitude: Tensor, waves: Tensor, *, pad: int) -> Tensor:
-    """Intensity (M, M) of an N × N pupil, M = pad·N, over the peak of the same pupil without aberrations; no shift.
-
-        PSF[v, u] = |Σ A exp(2πi W) exp(-2πi (u i + v j)/M)|² / (Σ A)²,   i column, j row
-
-    Raises EmptyPupil for a pupil without light; warns `Aliased` if W steps by more than half a wave between samples.
-    """
-    total = amplitude.sum()
-    if not bool((amplitude != 0).any()):
-        raise EmptyPupil("every sample of the pupil has amplitude 0")
-    for axis in (0, 1):
-        step = waves.diff(dim=axis).abs()
-        lit = (amplitude != 0).narrow(axis, 1, step.shape[axis]) & (amplitude != 0).narrow(axis, 0, step.shape[axis])
-        if bool((lit & (step > 0.5)).any()):
-            message = f"OPD steps by up to {float(step[lit].max()):.3g} waves between pupil samples"
-            warnings.warn(message, Aliased, stacklevel=calling_level())
-            break
-    size = pad * amplitude.shape[-1]
-    field = torch.fft.fft2(amplitude * phasor(waves), s=(size, size))
-    return (field.real**2 + field.imag**2) / (total * total)
 
 
 def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:

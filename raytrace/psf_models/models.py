@@ -47,7 +47,7 @@ from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
 from raytrace.tracing.scene import Memo, Scene, chief_landing, scene, symmetry
-from raytrace.words import RaytraceWarning, calling_level, option
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean, option
 
 PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 _PIXEL_BYTES = 16  # of a kernel and of the one that is added to it
@@ -85,7 +85,7 @@ class Model:
     traces: whether it traces rays, with derivatives in all numbers of the lens; otherwise it uses first-order data
         alone and images a field without distortion.
     waves: whether it includes diffraction: moments are those inside the window.
-    is_rung: whether `model="auto"` tries it.
+    is_automatic: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
     in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them: it is
@@ -110,7 +110,7 @@ class Model:
     of_points: Callable[[Scene, Grid, Tensor], Kernels] | None = None
     traces: bool = True
     waves: bool = False
-    is_rung: bool = False
+    is_automatic: bool = False
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
     by_field: bool = False
@@ -131,27 +131,30 @@ _wave_model = functools.partial(Model, waves=True, first=0.23, least=1e-3, most=
 # fmt: off
 _ROWS = (
     # First-order data: a Gaussian of the defocus blur.
-    Model("paraxial", "paraxial", paraxial.kernels, (0,), Paraxial, traces=False, is_rung=True, row=2),
+    Model("paraxial", "paraxial", paraxial.kernels, (0,), Paraxial, traces=False, is_automatic=True, row=2),
     # The same with diffraction: a defocused (and aberrated) circular pupil.
     _wave_model("fourier", "Fourier", fourier.kernels, range(-2, 6), Fourier, traces=False, row=3),
     # Centroid and covariance of traced rays. Gauss rings converge irregularly: the change of one order does not predict
     # that of the next, so the error is proven.
     Model(
         "gaussian", "Gaussian DRT", gaussian.kernels, (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), Gaussian,
-        lean=gaussian.kernels_alone, of_points=gaussian.kernels_of_points, is_rung=True, row=1, compared={"tol": 1e-3},
-        by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
+        lean=gaussian.kernels_alone, of_points=gaussian.kernels_of_points, is_automatic=True, row=1,
+        compared={"tol": 1e-3}, by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
     ),
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
     Model(
         "drt", "DRT", drt.kernels, range(11), DRT, plain=drt.kernels_of_rays, of_points=drt.kernels_of_points,
-        is_rung=True, row=0, in_common=True, compared={"model": DRT(rays=256)},
+        is_automatic=True, row=0, in_common=True, compared={"model": DRT(rays=256)},
         first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
-    _wave_model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_rung=True, by_field=True, row=4),
+    _wave_model("wave", "wave", wave.kernels, range(-2, 6), Wave, is_automatic=True, by_field=True, row=4),
 )
 # fmt: on
+
+#: Names of the diffraction PSF in other programs.
+_DIFFRACTION = ("huygens", "fft")
 
 #: The models by name, in order of growing fidelity.
 MODELS = {row.name: row for row in _ROWS}
@@ -166,12 +169,21 @@ class NotConverged(RaytraceWarning):
     """A PSF whose estimated error stays above the tolerance at the finest order."""
 
 
+def model_name(name: str, *others: str) -> str:
+    """The name of a model in MODELS, or one of the `others`, from a name in any case. Raises ValueError."""
+    known, word = (*others, *MODELS), name.lower()
+    if word not in known:
+        meant = "; the diffraction PSF is wave" if word in _DIFFRACTION else did_you_mean(name, known)
+        raise ValueError(f"model {name!r} is not known; expected {', '.join(known)}{meant}")
+    return word
+
+
 def model_of(name: str, **numbers: Any) -> Parameters:
     """A model with its numbers, by its name. Raises ValueError for an unknown name or number."""
-    if name == "auto" and "rays" in numbers:
-        raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
-    if name not in MODELS:
-        raise ValueError(f"the model {name!r} has no numbers; expected {', '.join(MODELS)}")
+    if name == "auto":
+        given = ", ".join(numbers)
+        raise ValueError(f"auto chooses by a tolerance: leave {given} out, or name the model that has {given}")
+    name = model_name(name)
     if "rays" in numbers and not MODELS[name].traces:
         raise ValueError(f"{name} traces no rays: leave rays out")
     known = {field.name for field in dataclasses.fields(MODELS[name].parameters)}
@@ -235,9 +247,8 @@ def psf(
     """
     execution = execution or Execution()
     center = center or ("chief" if fields is None or grid is None else "axis")
-    name = model if isinstance(model, str) else name_of(model)
+    name = model_name(model, "auto") if isinstance(model, str) else name_of(model)
     for parameter, (word, words) in {
-        "model": (name, ("auto", *MODELS)),
         "center": (center, ("axis", "chief", "centroid")),
         "window": (window, ("follows", "fixed")),
         "normalise": (normalise, ("energy", "window")),
@@ -393,8 +404,8 @@ def _driver(
         return dataclasses.replace(row, kernels=deal(row.kernels), lean=row.lean and deal(row.lean), plain=plain)
 
     if parameters is None:
-        rungs = [row for row in _ROWS if row.is_rung and (row.traces or paraxial.has_one_focus(lens))]
-        return functools.partial(climb, rungs=[configured(row, row.parameters()) for row in rungs], tol=tol)
+        candidates = [row for row in _ROWS if row.is_automatic and (row.traces or paraxial.has_one_focus(lens))]
+        return functools.partial(climb, candidates=[configured(row, row.parameters()) for row in candidates], tol=tol)
     model = configured(MODELS[name], parameters)
     if parameters.order is not None:
         return functools.partial(by_order, model=model, order=parameters.order)
@@ -519,13 +530,13 @@ def _of_halves(whole: Kernels, half: Kernels, batch: Scene, weights: Tensor | No
     return dataclasses.replace(psfs, error=_kernel_change(coarser, psfs).detach())
 
 
-def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
+def climb(batch: Scene, pixels: Grid, weights: Tensor | None, candidates: Sequence[Model], tol: float) -> Psf:
     """The first model whose kernels differ from those of the next by less than the tolerance.
 
     Where diffraction would need too many samples, the geometric model is returned with a NotConverged warning.
     """
-    here = by_tolerance(batch, pixels, weights, rungs[0], tol)
-    for model in rungs[1:]:
+    here = by_tolerance(batch, pixels, weights, candidates[0], tol)
+    for model in candidates[1:]:
         try:
             above = by_tolerance(batch, pixels, weights, model, tol)
         except (TooManyPoints, OverBudget) as error:
@@ -653,7 +664,6 @@ def plain_rays_shared(plain: Callable[..., Kernels], share: Share, scene: Scene,
         return points[:, share.part(count)], weights[share.part(count)]
 
     light = plain(scene, grid, rays=rays, sampling=some)
-    assert light.arrived is not None  # as of independent rays
     arrived, centroid, covariance = (
         gathered(t).movedim(0, -1) for t in (light.arrived, light.centroid, light.covariance)
     )

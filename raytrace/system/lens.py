@@ -329,8 +329,8 @@ class Fields:
         return torch.hypot(self.x, self.y).amax()
 
 
-#: Methods of modules and tensors of torch that a lens, a value, lacks: the function in their place.
-_IN_TORCH = {
+#: Names that a lens lacks: methods of torch's modules and tensors, first-order data; the function in their place.
+_ELSEWHERE = {
     **dict.fromkeys(
         ("to", "cpu", "cuda", "float", "double", "dtype", "device"),
         "; `rt.to(lens, dtype=…, device=…)` converts it, and its tensors have dtype and device",
@@ -339,6 +339,8 @@ _IN_TORCH = {
         ("parameters", "named_parameters", "requires_grad_", "train", "state_dict", "load_state_dict"),
         '; it is a value: `rt.Variables(lens, "curvature thickness")` is the module of its numbers',
     ),
+    **dict.fromkeys(("efl", "focal_length", "effective_focal_length"), "; rt.first_order(lens).effective_focal_length"),
+    "f_number": "; rt.first_order(lens).f_number",
 }
 
 
@@ -401,7 +403,7 @@ class Lens:
         return self.wavelengths[self.primary_wavelength - 1]
 
     def __getattr__(self, name: str) -> NoReturn:
-        raise AttributeError(f"'Lens' object has no attribute {name!r}{_IN_TORCH.get(name, '')}", name=name, obj=self)
+        raise AttributeError(f"'Lens' object has no attribute {name!r}{_ELSEWHERE.get(name, '')}", name=name, obj=self)
 
     def __repr__(self) -> str:
         several = "" if self.count is None else f"{self.count} lenses of "
@@ -439,11 +441,12 @@ class Lens:
     ) -> "Lens":
         """The same lens under other conditions; a condition that is None stays.
 
-        object_distance: mm from the object to surface 1, inf allowed; sensor_distance: mm from the last surface before
-        the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
-        weight and the first one primary unless wavelength_weights (W,) and primary_wavelength, its number from 1, are
-        given; fields: y, or (x, y), in the lens's own kind, without vignetting factors, alike in weight unless
-        field_weights (F,) are given; weights: relative;
+        object_distance: mm from the object to surface 1, inf allowed; the sensor distance is unchanged: refocus by
+        `rt.focus`; sensor_distance: mm from the last surface before the image; f_number: image-space,
+        EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in weight and the first one primary
+        unless wavelength_weights (W,) and primary_wavelength, its number from 1, are given; fields: y, or (x, y), in
+        the lens's own kind, without vignetting factors, alike in weight unless field_weights (F,) are given; weights:
+        relative;
         temperature: °C, pressure: atm, 0 in vacuum; where one of the two is None, it stays, or is 20 °C or 1 atm. Warns
         NoThermalCoefficients. configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
         Raises ValueError for conditions that no lens has.

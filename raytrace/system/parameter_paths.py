@@ -239,7 +239,7 @@ def sensor(lens: Lens) -> int:
 
 
 def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
-    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1..0". Raises BadVariables."""
+    """Bounds by name of a list like "sensor:57.5..58", or "sensor:57.5,58". Raises BadVariables."""
     bounds = {}
     for word in text.split():
         name, _, ends = word.rpartition(":")
@@ -247,7 +247,7 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
             first, last = ends.split(".." if ".." in ends else ",")
             low, high = float(first or -math.inf), float(last or math.inf)
         except ValueError as error:
-            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
+            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8..12") from error
         if not low < high:
             raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
         bounds[name] = (low, high)

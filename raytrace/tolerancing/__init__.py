@@ -9,9 +9,9 @@ criteria        RMS spot radius, RMS wavefront, MTF, merit, change of the PSF, b
 study           `Study`: a criterion as a function of errors and compensators, its best compensators, its second order
 tightening      limits by inverse sensitivity, and those of a yield at least total tightness
 monte_carlo     the criterion of random lenses, resumable
-analysis        `tolerance_analysis` and its result: sensitivities, expectation, trials, table and figure
+analysis        `tolerance` and its result: sensitivities, expectation, trials, table and figure
 as_built        `AsBuilt`: the expectation as a term of a merit function, with exact derivatives
-grades          `tolerance_table`: rows of published grades and of limits
+grades          `tolerances`: rows of published grades and of limits
 jacobian        `jacobian`: derivatives of any quantity by design variables and errors
 
 A kind of error is a row of `KINDS` in `system/tolerance_data.py`.

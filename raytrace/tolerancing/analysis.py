@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -21,8 +22,8 @@ from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.tolerance_data import Tolerance
+from raytrace.tolerancing import grades
 from raytrace.tolerancing.criteria import Criterion, Sampling, criterion_of
-from raytrace.tolerancing.grades import tolerance_table
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.sampling import draw_errors
@@ -30,7 +31,7 @@ from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
 from raytrace.tolerancing.table import BadTolerance, ToleranceTable, groups_of
 from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.words import option
+from raytrace.words import RaytraceWarning, calling_level, option
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +41,10 @@ PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 _MODEL = 2**15  # draws of the second-order model
 _CHECKED, _UNEXPLAINED = 64, 0.25  # lenses that the model is compared with; accepted part of their standard deviation
 _NEGATIVE = 0.02  # accepted share of draws whose mean square is negative by second order
+
+
+class GoalMissed(RaytraceWarning):
+    """A goal of the criterion that the nominal lens itself misses."""
 
 
 @value
@@ -378,7 +383,7 @@ def _factor(new: Tolerance, old: Tolerance) -> float:
     return (new.maximum - new.minimum) / wide if wide else 1.0
 
 
-def tolerance_analysis(
+def tolerance(
     lens: Lens,
     tolerances: ToleranceTable | None = None,
     *,
@@ -408,9 +413,9 @@ def tolerance_analysis(
     configurations by the weights of the file (CWGT), equal by default. For `lens.configuration(2)` alone, remove the
     others by `operands=()`.
 
-    tolerances: as `tolerance_table` or `read_tolerances` return them; by default those of the lens's own file, or of
+    tolerances: as `tolerances` or `read_tolerances` return them; by default those of the lens's own file, or of
         `grade` and `limits`.
-    grade: tolerances of published grades instead of the file's, see `tolerance_table`.
+    grade: tolerances of published grades instead of the file's, see `tolerances`.
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
@@ -423,7 +428,9 @@ def tolerance_analysis(
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
         more than this, in its unit. Tighter limits stay.
-    goal: largest criterion of a good lens, of the MTF the smallest; the share of good lenses is reported.
+    goal: value of the criterion that a good lens reaches, in its unit: its largest, of the MTF its smallest. Alone it
+        reports the share of good lenses (yield); with `yield_` it tightens the limits. Warns GoalMissed of one that the
+        nominal lens misses.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
         least total tightness until this share reaches the goal, by second order corrected by traced lenses.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
@@ -444,7 +451,7 @@ def tolerance_analysis(
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
-        tolerances = tolerance_table(lens, limits, grade=grade)
+        tolerances = grades.tolerances(lens, limits, grade=grade)
     elif grade or limits:
         raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if not len(tolerances):
@@ -469,6 +476,15 @@ def tolerance_analysis(
                 f"no ray of a field reaches the sensor of the nominal lens; give other {option('fields')}"
             )
         nominal = chosen.value(nominal_quantity[0])
+        if goal is not None and chosen.sign * float(nominal) > chosen.sign * goal:
+            message = (
+                f"{option('goal')} {goal:g} {chosen.unit}".rstrip()
+                + f": the nominal lens has {float(nominal):.4g} and does not reach the goal, a value of the criterion; "
+                f"a share of the lenses is {option('yield_', 0.9)}"
+            )
+            if yield_ is not None:
+                raise BadTolerance(message)
+            warnings.warn(message, GoalMissed, stacklevel=calling_level())
         if increment is not None:
             tolerances = limited_to_change(tolerances, lambda errors: study.harm(errors)[0], increment)
             study = Study(views, tolerances, light_loss)
@@ -501,10 +517,6 @@ def tolerance_analysis(
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
-
-
-#: Former names.
-tolerance = tolerance_analysis
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:

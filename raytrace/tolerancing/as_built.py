@@ -26,7 +26,7 @@ from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.problem import NoLight
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.rays import Rays
-from raytrace.tolerancing.grades import tolerance_table
+from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.study import focuses, moments, sampling_of
 from raytrace.tolerancing.table import BadTolerance, ToleranceTable
@@ -52,8 +52,8 @@ class AsBuilt:
     E[q] is the expected mean square spot radius of the manufactured and refocused lens, in the square of the unit of
     length of the merit function; of merit="spot" M² is that of the nominal lens.
 
-    grade, limits: of `tolerance_table`, by default those of the lens's file; tolerances: instead of both. weight: above
-    0; a large one minimises the lens as built alone. fields: as of `tolerance_analysis`, by default those of the lens,
+    grade, limits: of `tolerances`, by default those of the lens's file; tolerances: instead of both. weight: above
+    0; a large one minimises the lens as built alone. fields: as of `tolerance`, by default those of the lens,
     mirrored along y; rings, arms: of the pupil. Raises BadTolerance, ValueError.
     """
 
@@ -92,7 +92,7 @@ class AsBuiltTerm:
     def __init__(self, settings: AsBuilt, lens: Lens):
         prepare()
         self.settings, rows = settings, settings.tolerances
-        self.tolerances = tolerance_table(lens, settings.limits, grade=settings.grade) if rows is None else rows
+        self.tolerances = tolerances(lens, settings.limits, grade=settings.grade) if rows is None else rows
         if not len(self.tolerances):
             raise BadTolerance(f"no tolerances; give a {option('grade')}, {option('limits')} or `tolerances`")
         self.limits = _focus_limits(lens, self.tolerances)

@@ -153,7 +153,7 @@ WORDS = {
 _LIMITS = re.compile(r"([a-z_]+)(?::([\d,-]+))?=(?:([^%]+?)\.\.)?([^%]+?)(%?)")
 
 
-def tolerance_table(
+def tolerances(
     lens: Lens,
     limits: str | Sequence[str] = "",
     *,
@@ -202,10 +202,6 @@ def tolerance_table(
     changed = len(rows) != len(stored.rows) or any(a is not b for a, b in zip(rows, stored.rows, strict=True))
     saves = () if changed else stored.saves  # which count the rows of the file
     return dataclasses.replace(stored, rows=tuple(rows), compensators=tuple(compensators), saves=saves)
-
-
-#: Former name.
-tolerances = tolerance_table
 
 
 class _Limit(NamedTuple):

@@ -23,7 +23,7 @@ from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
 from raytrace.system.tolerance_data import Tolerance
-from raytrace.tolerancing.grades import tolerance_table
+from raytrace.tolerancing import grades
 from raytrace.tolerancing.perturbation import Perturbation
 from raytrace.tolerancing.table import ToleranceTable
 from raytrace.tracing.launch import rays
@@ -100,7 +100,7 @@ def _paths(end: Rays) -> Tensor:
 
 #: Quantities of rays behind the lens, by the name of `of`.
 OF_RAYS: dict[str, Callable[[Rays], Tensor]] = {
-    "landing points": _landing_points,
+    "points": _landing_points,
     "directions": _directions,
     "paths": _paths,
 }
@@ -110,7 +110,7 @@ def jacobian(
     lens: Lens,
     vary: str | Sequence[str | Vary] | None = None,
     *,
-    of: str | Callable[[Lens], Tensor] = "landing points",
+    of: str | Callable[[Lens], Tensor] = "points",
     tolerances: ToleranceTable | Iterable[Tolerance] | None = None,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
@@ -122,30 +122,31 @@ def jacobian(
     """A quantity of a lens and its derivatives by all design variables and errors of manufacture, in one pass.
 
     vary: variables, pickups and solves, as of `optimize`; by default the file's, or none where errors are named.
-    of: "landing points" (2, F, W, P) mm on the image, "directions" (3, F, W, P) behind the lens, "paths" (F, W, P) mm,
-    less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the residuals (m,)
-    of a merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that returns a tensor
-    (...), as lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the variables, each 0,
-    as of `perturbed`; grade, limits: as of `tolerance_table` instead. Derivatives are exact to rounding; failed rays
-    have 0. Raises BadVariables, BadTolerance, TypeError, ValueError.
+    of: "points" (2, F, W, P) mm, where rays land on the image, "directions" (3, F, W, P) behind the lens, "paths"
+    (F, W, P) mm, less the axial ray's, of the rays of fields, wavelengths and pupil points as of `rays`; "merit", the
+    residuals (m,) of a merit function as of `evaluate`, whose squares sum up to M²; or a function of a lens that
+    returns a tensor (...), as lambda lens: rt.spot(lens).whole.rms_radius. tolerances: rows whose errors follow the
+    variables, each 0, as of `perturbed`; grade, limits: as of `tolerances` instead. Derivatives are exact to rounding;
+    failed rays have 0. Raises BadVariables, BadTolerance, TypeError, ValueError.
     """
+    selected = of.removeprefix("landing ") if isinstance(of, str) else of  # former name: landing points
     of_rays = [
         name
         for name, given in (("fields", fields), ("wavelengths", wavelengths), ("pupil", pupil))
         if given is not None
     ]
-    if of_rays and not (isinstance(of, str) and of in OF_RAYS):
+    if of_rays and not (isinstance(selected, str) and selected in OF_RAYS):
         raise ValueError(
             f"jacobian: {option(of_rays[0])} belongs to quantities of rays, {', '.join(OF_RAYS)}: leave it out"
         )
-    if merit is not None and of != "merit":
+    if merit is not None and selected != "merit":
         raise ValueError(
             f"jacobian: {option('merit')} belongs to {option('of', 'merit')}: name it, or leave the merit function out"
         )
     perturbation = _perturbation(lens, tolerances, grade, limits)
     alone = vary is None and perturbation is not None
     model = DesignVariables(lens) if alone else design_variables(lens, vary)
-    if of == "merit":
+    if selected == "merit":
         if perturbation is not None:
             raise ValueError(
                 "jacobian: the residuals of a merit function have derivatives by design variables alone; for errors "
@@ -153,10 +154,10 @@ def jacobian(
             )
         quantity, derivatives = _of_merit(model, lens, merit)
     else:
-        if callable(of):
-            function = of
-        elif of in OF_RAYS:
-            function = _of_rays(OF_RAYS[of], fields, wavelengths, pupil)
+        if callable(selected):
+            function = selected
+        elif selected in OF_RAYS:
+            function = _of_rays(OF_RAYS[selected], fields, wavelengths, pupil)
         else:
             known = (*OF_RAYS, "merit")
             raise ValueError(
@@ -176,7 +177,9 @@ def jacobian(
         derivatives,
         (*map(name_of, model.variables), *rows),
         torch.as_tensor(np.concatenate([model.start, np.zeros(len(rows))])),
-        of if isinstance(of, str) else getattr(of, "__name__", "a function").replace("<lambda>", "a function"),
+        {"points": "landing points"}.get(selected, selected)
+        if isinstance(selected, str)
+        else getattr(selected, "__name__", "a function").replace("<lambda>", "a function"),
     )
 
 
@@ -188,7 +191,7 @@ def _perturbation(
         raise ValueError(f"jacobian: `tolerances` are given: leave {option('grade')} and {option('limits')} out")
     if tolerances is None and not (grade or limits):
         return None
-    return Perturbation(lens, tolerance_table(lens, limits, grade=grade) if tolerances is None else tolerances)
+    return Perturbation(lens, grades.tolerances(lens, limits, grade=grade) if tolerances is None else tolerances)
 
 
 def derivatives_of(function: Callable[[Lens], Tensor], lens: Lens, count: int) -> tuple[Tensor, Tensor]:

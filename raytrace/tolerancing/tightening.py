@@ -29,7 +29,7 @@ from torch import Tensor
 
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
-from raytrace.tolerancing.table import BadTolerance, ToleranceTable
+from raytrace.tolerancing.table import ToleranceTable
 
 _HALVINGS = 30  # of a limit, to 1e-9 of it
 _DRAWS, _OTHERS = 4096, 2**15  # of the second-order model, by which factors are found, and others that judge them
@@ -81,10 +81,8 @@ def limited_to_yield(
     """The tolerances of least total tightness by which a share of the lenses, as they are traced, has q ≤ goal.
 
     traced: errors (L, N) -> q (L,), nan of a lens that fails. Limits that already give the share stay as they are.
-    Raises BadTolerance where the lens without errors does not reach the goal.
+    The lens without errors reaches the goal.
     """
-    if float(traced(torch.zeros(1, len(tolerances)))) > goal:
-        raise BadTolerance("the nominal lens itself does not reach the goal; choose a goal that it reaches")
     others, checked = (draw_errors(tolerances, count, seed + k + 1) for k, count in enumerate((_OTHERS, _TRACED)))
 
     def good(s: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""Radial engine: elements that depend on the distance from the axis alone, along one radius.
+"""Propagation from a phase element to the sensor: a radial engine, and engines of transfer functions.
+
+Radial engine: elements that depend on the distance from the axis alone, along one radius.
 
     U(ρ) = 2π/λ ∫_0^R A exp(ik W_residual(r)) J₀(k ρ t(r)) z/(r² + z²) r dr,   t = r/z; true spheres t = r/√(r² + z²)
 

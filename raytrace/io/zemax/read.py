@@ -1,4 +1,4 @@
-"""Read a sequential lens file of Zemax OpticStudio (.zmx).
+"""Read a sequential lens file of Zemax OpticStudio (.zmx); surface types and their parameters: `surfaces.py`.
 
 Three stages: text -> records with line numbers -> the keyword table -> Lens. Conventions, each verified against numbers
 that OpticStudio itself stored:
