@@ -15,6 +15,7 @@ OVERVIEW = (ROOT / "docs" / "reference" / "overview.md").read_text(encoding="utf
 #: Pages whose Python runs, each in one namespace of its own; `lens` and `torch` are those of the README's example.
 PYTHON = [
     ROOT / "README.md",
+    ROOT / "docs" / "index.md",
     *(
         ROOT / "docs" / "reference" / f"{name}.md"
         for name in ("lens_files", "rays", "psf", "learning", "rendering", "merit", "opticstudio")
