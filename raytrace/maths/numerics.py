@@ -23,7 +23,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass as value
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
 import torch
@@ -45,6 +45,8 @@ class Dataclass(Protocol):
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
 
+F = TypeVar("F", bound=Callable[..., Any])
+
 #: A context in which torch's functions take tensors of a subclass as plain ones.
 plain_functions = torch._C.DisableTorchFunctionSubclass
 
@@ -57,6 +59,29 @@ def in_transform() -> bool:
 def in_forward_mode() -> bool:
     """Whether a forward derivative of torch is under way."""
     return getattr(forward_ad, "_current_level", -1) >= 0
+
+
+def as_tensor(numbers: Any, **like: Any) -> Tensor:
+    """A tensor as it is, where `torch.as_tensor` moves one on the processor to a default device; other numbers on it.
+
+    like: dtype of other numbers.
+    """
+    return numbers if isinstance(numbers, Tensor) else torch.as_tensor(numbers, device="cpu", **like)
+
+
+def uncompiled(function: F) -> F:
+    """A function that `torch.compile` does not enter: a graph ends before it, and the next one begins behind it.
+
+    `torch.compiler.disable` alone imports the compiler, which takes seconds.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():
+            return torch.compiler.disable(function)(*arguments, **options)
+        return function(*arguments, **options)
+
+    return cast(F, call)
 
 
 def varies(number: object) -> bool:
@@ -298,7 +323,7 @@ def select(condition: Tensor | bool, a: Number, b: Number) -> Number:
     if not isinstance(condition, Tensor):
         return a if condition else b
     # Of two plain numbers torch.where makes a tensor of 32 bits.
-    return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64))
+    return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64, device="cpu"))
 
 
 def root(x: Number) -> Number:
