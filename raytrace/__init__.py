@@ -208,6 +208,7 @@ ERRORS = {
     "DarkPlaces": "imaging.field_kernels",
     "EmptyPsf": "psf_models.result",
     "EmptySpot": "tracing.spot",
+    "EnergyOutside": "imaging.field_kernels",
     "FailedElsewhere": "shards",
     "GoalMissed": "tolerancing.analysis",
     "HeightMapError": "wave_optics.height_maps",

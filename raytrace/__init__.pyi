@@ -46,6 +46,7 @@ from raytrace.files import NotWritten as NotWritten
 from raytrace.imaging import Camera as Camera
 from raytrace.imaging import Variables as Variables
 from raytrace.imaging.field_kernels import DarkPlaces as DarkPlaces
+from raytrace.imaging.field_kernels import EnergyOutside as EnergyOutside
 from raytrace.imaging.field_kernels import WindowTooLarge as WindowTooLarge
 from raytrace.imaging.pictures import NoPictures as NoPictures
 from raytrace.imaging.render import BeyondFields as BeyondFields

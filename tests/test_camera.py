@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -35,20 +36,22 @@ from raytrace.imaging.codesign import (
     run_model,
     write_outcome,
 )
+from raytrace.imaging.field_kernels import EnergyOutside
 from raytrace.imaging.image import blur
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import Run, Share
-from raytrace.imaging.variables import Variables
+from raytrace.imaging.variables import PhaseVariables, Variables
 from raytrace.io import read_lens
 from raytrace.maths.sampling import gauss_rings
-from raytrace.psf_models import Gaussian, psf
+from raytrace.psf_models import DRT, Gaussian, Paraxial, psf
 from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
 from raytrace.system.parameter_paths import BadVariables
-from raytrace.tracing.focus import NoImage, best_focus
+from raytrace.tracing.focus import NoImage, best_focus, focused
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.wave_optics.element import phase_element
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
 SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
@@ -541,6 +544,32 @@ def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():
         own(torch.rand(1, 1, 32, 32), 25e3, points=torch.tensor([[12.1], [0.0]]))
 
 
+@pytest.mark.parametrize(("model", "field"), [(Paraxial(), 0), (Gaussian(order=4), 11), (DRT(order=2), 11)])
+def test_light_outside_the_windows_is_a_number_and_a_warning(model, field):
+    """Kernels of sum 1 hide it: of a sensor 3 mm out of focus, of a field whose beam is vignetted."""
+    lens = focused(read_lens("cooke_triplet").at(f_number=16, wavelengths=[0.55]), 2e4)
+    own = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[field], pixels=11, model=model)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EnergyOutside)
+        own.kernels(2e4)
+    with torch.no_grad():
+        own.variables.sensor.fill_(3.0)
+    expected = psf(
+        own.variables(), model, fields=own.fields, object_distances=[2e4], center="chief", pixel=0.005, size=11
+    )
+    outside = own.energy_outside([2e4])
+    assert float(outside) == pytest.approx(float(expected.energy_outside), rel=1e-2)  # chief rays differ
+    assert 0.5 < float(outside) < 1
+    slope = torch.autograd.grad(outside.sum(), own.variables.sensor)[0]
+    assert float(slope) > 0
+    with pytest.warns(EnergyOutside, match=rf"{100 * float(outside):.0f} % of the light .* 11 pixels"):
+        kernels = own.kernels(2e4)
+    assert float(kernels.sum()) == pytest.approx(1, abs=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EnergyOutside)
+        own.kernels(2e4)
+
+
 def test_a_lens_that_follows_parameters_is_copied_with_its_graph():
     variables = Variables(read_lens("cooke_triplet"), "sensor")
     lens = copy.deepcopy(variables())
@@ -548,3 +577,52 @@ def test_a_lens_that_follows_parameters_is_copied_with_its_graph():
     assert float(gradient) == 1.0
     fixed = copy.deepcopy(variables.lens)
     assert fixed.surfaces[1].curvature is not variables.lens.surfaces[1].curvature
+
+
+def test_a_training_resumes_bit_identically_with_the_order_of_its_first_call(tmp_path):
+    """Adam moves the sensor by -1 mm: a plan for this lens has another order."""
+    pictures = torch.rand(2, 22, 22, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    lens = read_lens("cooke_triplet").at(wavelengths=[0.55])
+
+    def started():
+        torch.manual_seed(0)
+        network = RedNet(RedNetShape(2, 2))
+        own = Camera(Variables(lens, "sensor"), network, sensor=NOISY, fields=[0], pixels=7, model="drt")
+        return own, torch.optim.Adam(own.rates(optics=1.0, network=1e-3))
+
+    def train(own, optimizer, steps):
+        for step in steps:
+            loss = (own(pictures, [2e4, 3e4], index=[2 * step, 2 * step + 1]) - own.target(pictures)).abs().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+
+    own, optimizer = started()
+    train(own, optimizer, range(1))
+    torch.save({"camera": own.state_dict(), "optimizer": optimizer.state_dict()}, tmp_path / "state.pt")
+    resumed, again = started()
+    stored = torch.load(tmp_path / "state.pt", weights_only=True)
+    resumed.load_state_dict(stored["camera"])
+    again.load_state_dict(stored["optimizer"])
+    assert torch.equal(resumed.kernels([2e4, 3e4]), own.kernels([2e4, 3e4]))
+    for each in ((own, optimizer), (resumed, again)):
+        train(*each, range(1, 3))
+    ends = [[*each.parameters()] for each in (own, resumed)]
+    assert all(map(torch.equal, *ends))
+    assert own.plan() != started()[0].plan()
+
+
+def test_a_state_keeps_an_order_that_is_given_and_the_sampling_of_an_element():
+    lens = read_lens("cooke_triplet")
+    own = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[0], model=Gaussian(order=2))
+    other = Camera(Variables(lens, "sensor"), Same(), sensor=NOISY, fields=[0], model=Gaussian(order=3))
+    other.load_state_dict(own.state_dict())
+    assert (own._order, other._order) == (2, 3)
+    element = phase_element([0.0, -1e-3], profile="powers", aperture=1.0, glass=1.5)
+    alone = [
+        Camera(PhaseVariables(element), Same(), sensor=NOISY, sensor_distance=35.5, object_distances=(1e3, 2e3))
+        for _ in range(2)
+    ]
+    alone[0].plan()
+    alone[1].load_state_dict(alone[0].state_dict())
+    assert alone[1]._sampling == alone[0]._sampling

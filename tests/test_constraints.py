@@ -193,7 +193,7 @@ def test_every_word_is_an_operand_that_is_known():
 
 
 def test_the_page_lists_every_word():
-    page = (Path(__file__).parents[1] / "docs" / "merit.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "merit.md").read_text(encoding="utf-8")
     assert all(f"| `{name}` | {word.operand} | {word.text}" in page for name, word in WORDS.items())
 
 

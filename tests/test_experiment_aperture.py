@@ -1,6 +1,7 @@
 """Parts of the study of apertures at equal light."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -65,3 +66,17 @@ def test_the_table_lists_choices_and_losses():
     line = aperture.table(rows).splitlines()[-1]
     assert line.startswith("| L | D | B | F/4 | F/8 | F/8 | F/8 | F/8 |")
     assert "| 3.01 ± 0.00 | 0 | 0 | 0 |" in line
+    assert aperture.counts(rows) == (
+        "level with waves to 0.1 dB in paraxial 0, fourier 1, gaussian 1, drt 1 of 1 scenes; waves undecided in 0"
+    )
+
+
+def test_the_counts_of_the_page_are_those_of_its_rows():
+    folder = Path(__file__).parents[1] / "docs"
+    rows = aperture.stored(folder / "camera_aperture.csv")
+    assert aperture.counts(rows) == (
+        "level with waves to 0.1 dB in paraxial 4, fourier 4, gaussian 4, drt 5 of 8 scenes; waves undecided in 3"
+    )
+    page = (folder / "camera_aperture.md").read_text("utf-8")
+    for line in aperture.table(rows).splitlines()[2:]:
+        assert line.split("|", 4)[-1].replace("-", "−") in page

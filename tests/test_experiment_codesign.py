@@ -410,13 +410,13 @@ def test_the_page_names_settings_that_are_not_usual():
     assert "--noise" not in command
     assert "| paraxial | 2 | 0.0415 ± 0.0000 | 0.0504 ± 0.0000 | +21.4 % | 33.9 ± 0.1 |" in page
     assert "**Unfinished: 6 of 7 runs.** Missing, by model and seed: drt 2." in page
-    assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
+    assert f"![Loss in training](codesign/loss.png)\n\n*{CAPTIONS['loss.png']}*" in page
     assert kept_of(page) == "By hand."
     assert "[claims.csv](codesign/claims.csv)" in page
-    assert "[codesign_sweep.md](codesign_sweep.md)" in page
+    assert "[sweep.csv](codesign/sweep.csv)" in page
     other = markdown(dataclasses.replace(report, is_of_paper=False).parts())
     assert "paper" not in other
-    assert "codesign_sweep.md" not in other
+    assert "sweep.csv" not in other
     second = markdown(dataclasses.replace(report, folder="second", is_of_paper=False).parts())
     assert "--page second" in second.splitlines()[4]
     assert "](second/loss.png)" in second

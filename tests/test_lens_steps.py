@@ -2,6 +2,7 @@
 
 import copy
 import io
+import warnings
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from raytrace.imaging.closed_form import (
     optimise_closed_form,
 )
 from raytrace.imaging.lens_steps import LensSteps
+from raytrace.tracing.geometry import Unbuildable
 
 TRIPLET = rt.read_lens("cooke_triplet")
 FREQUENCY = torch.fft.fftfreq(40, dtype=torch.float64)
@@ -81,6 +83,40 @@ def test_a_step_leaves_bounds_fixed_numbers_and_copies():
     assert after["sensor"] != before["sensor"]
     assert copy.deepcopy(own).variables.numbers() == after
     torch.save(own, io.BytesIO())
+
+
+def test_steps_of_a_loaded_state_are_those_that_were_not_interrupted():
+    """The curvature that the first steps have found is in the state."""
+    model = rt.psf_models.Gaussian(order=3)
+    own, resumed = camera("curvature:1 sensor", model=model), camera("curvature:1 sensor", model=model)
+
+    def step(of):
+        return of.lens_step(lambda: -of.kernels(2e4).square().sum())
+
+    step(own)
+    resumed.load_state_dict(own.state_dict())
+    assert step(own) == step(resumed)
+    assert resumed.variables.numbers() == own.variables.numbers()
+
+
+def test_a_step_to_a_lens_that_cannot_be_made_is_said_once():
+    """A loss that wants a thinner lens; the same step under the condition that holds the limits is none."""
+
+    def thinner(own):
+        return lambda: sum(surface.thickness for surface in own.variables().surfaces[1:-2]) ** 2
+
+    own = camera("thickness:1-5 sensor")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(4):
+            own.lens_step(thinner(own))
+    (warning,) = [each.message for each in caught if each.category is Unbuildable]
+    assert "hold='buildable'" in str(warning)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Unbuildable)
+        held = camera("thickness:1-5 sensor", "buildable")
+        for _ in range(3):
+            held.lens_step(thinner(held))
 
 
 def test_a_camera_without_a_lens_says_what_to_do():

@@ -69,7 +69,7 @@ def test_pages_state_the_counts_of_the_cases():
     agree, total, theirs = map(str, counts)
     root = Path(__file__).parents[1]
     for page, words in (
-        ("docs/opticstudio.md", f"{agree} of {total} figures"),
+        ("docs/reference/opticstudio.md", f"{agree} of {total} figures"),
         (
             "docs/reference/accuracy.md",
             f"{total} figures of OpticStudio: {agree} agree to the digits printed, {theirs} ",
@@ -77,7 +77,7 @@ def test_pages_state_the_counts_of_the_cases():
         ("README.md", f"of {total} figures that it printed, {agree} agree"),
     ):
         assert words in (root / page).read_text("utf-8"), page
-    table = (root / "docs" / "opticstudio.md").read_text("utf-8")
+    table = (root / "docs" / "reference" / "opticstudio.md").read_text("utf-8")
     rows = re.findall(r"^\|[^|]+\| (\d+) \| (\d+) \| (\d*) *\|$", table, re.M)
     assert tuple(sum(int(row[k] or 0) for row in rows) for k in (1, 0, 2)) == counts
 

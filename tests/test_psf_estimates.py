@@ -136,7 +136,7 @@ def reference(model: str, lens: Lens, options: dict):
             computed = dense_gaussian(batch, window)
         elif model == "drt":
             nothing = number([0.0]).expand(3, *batch.shape)
-            computed = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
+            computed = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0, nothing[0])
         else:
             computed = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
         return polychromatic(computed, batch, options["wavelength_weights"], model)
@@ -153,7 +153,9 @@ def dense_gaussian(batch: Scene, window) -> Kernels:
     covariance = torch.stack([(energy * a * b).sum(-1) / total for a, b in ((x, x), (x, y), (y, y))])
     centre = dataclasses.replace(window, centre=window.centre[:, None, None, None].expand(2, *batch.shape))
     share = total * beam_share(batch)
-    return Kernels(share[..., None, None] * gaussian_pixels(centre, mean, covariance), centre, mean, covariance, 0)
+    return Kernels(
+        share[..., None, None] * gaussian_pixels(centre, mean, covariance), centre, mean, covariance, 0, share
+    )
 
 
 def true_error(one, converged) -> float:

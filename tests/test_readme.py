@@ -15,8 +15,10 @@ OVERVIEW = (ROOT / "docs" / "reference" / "overview.md").read_text(encoding="utf
 #: Pages whose Python runs, each in one namespace of its own; `lens` and `torch` are those of the README's example.
 PYTHON = [
     ROOT / "README.md",
-    *(ROOT / "docs" / "reference" / f"{name}.md" for name in ("lens_files", "rays", "psf", "learning", "rendering")),
-    *(ROOT / "docs" / f"{name}.md" for name in ("merit", "opticstudio")),
+    *(
+        ROOT / "docs" / "reference" / f"{name}.md"
+        for name in ("lens_files", "rays", "psf", "learning", "rendering", "merit", "opticstudio")
+    ),
 ]
 #: Pages of every public name with an example each.
 API = sorted((ROOT / "docs" / "reference").glob("api_*.md"))

@@ -14,6 +14,7 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
+from raytrace.optimization.curriculum import Plan, Step
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.one_element import thinned
@@ -381,6 +382,62 @@ def test_minima_of_the_merit_are_followed_to_minima_of_a_loss(tmp_path):
     assert "loss" in str(of_loss)
     with pytest.raises(NoProblem, match="as_built"):
         rt.search(triplet, loss=mean_distance, as_built=rt.tolerancing.AsBuilt(grade="precision"), **how)
+
+
+# -- a curriculum ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def phone_plates():
+    return rt.read_lens("phone_plates")
+
+
+def test_a_step_has_its_part_of_aperture_and_field_and_its_terms(phone_plates):
+    plan = Plan("phone", phone_plates, None, None, "efl=6 chief_ray_angle<=30", None)
+    first = plan.problem(phone_plates, Step(0.4, 0.5, 4))
+    last = plan.problem(phone_plates, Step(1.0, 1.0, 9, ("conic", "a4"), 6))
+    assert float(rt.first_order(first.model.lens).entrance_pupil_diameter) == pytest.approx(0.4 * 3)
+    assert first.model.lens.fields.y.tolist() == pytest.approx([0, 5, 10, 15])
+    assert last.model.lens.fields.extent == pytest.approx(30)
+    assert len(last.model.variables) == len(first.model.variables) + 20
+    held = {condition.name: (condition.relation, condition.row.target) for condition in last.conditions}
+    assert held == {"efl": ("=", 6.0), "chief_ray_angle": ("<=", 30.0), "total_track": ("<=", 8.1), "bfd": (">=", 0.48)}
+    assert first.glass == pytest.approx((0.18, 0.96))
+
+
+@pytest.mark.parametrize(
+    ("lens", "hold", "said"),
+    [
+        ("phone_plates", None, "needs the focal length"),
+        ("folded_relay", "efl=6", "kind"),
+    ],
+)
+def test_a_curriculum_refuses_what_it_cannot_begin_with(lens, hold, said):
+    with pytest.raises(NoProblem, match=said):
+        rt.search(lens, kind="phone", hold=hold)
+
+
+def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
+    with pytest.raises(NoProblem, match="did you mean phone"):
+        rt.search(phone_plates, kind="fone", hold="efl=6")
+    with pytest.raises(NoProblem, match="exclude one another"):
+        rt.search(phone_plates, kind="phone", insert=True)
+
+
+@pytest.mark.slow
+def test_from_plates_to_a_phone_lens_that_is_as_sharp_between_its_fields(phone_plates, tmp_path):
+    result = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    lens = result.lens
+    assert result.stopped == "steps"
+    data = rt.first_order(lens)
+    assert float(data.effective_focal_length) == pytest.approx(6, rel=1e-6)
+    assert float(data.f_number) == pytest.approx(2, rel=1e-6)
+    dense = rt.spot(lens, fields=torch.linspace(0, 30, 61).tolist(), rings=20)
+    assert float(dense.whole.rms_radius.max()) < 0.004
+    assert float(result.between[0]) < 1.5
+    assert sum(float(surface.thickness) for surface in lens.surfaces[1:-1]) < 1.35 * 6 + 1e-6
+    again = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    assert torch.equal(again.variables, result.variables)
 
 
 # -- the journal -------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, field
 import raytrace as rt
 from raytrace.maths.numerics import to
 from raytrace.maths.sampling import SAMPLINGS, grid, sobol, with_rim
-from raytrace.psf_models import DRT, Execution, psf
+from raytrace.psf_models import DRT, Execution, Gaussian, Wave, psf
 from raytrace.psf_models.drt import kernels_of_rays, stream_kernels
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
@@ -296,6 +296,22 @@ def test_energy_of_a_psf_is_accounted_for():
     assert 0.3 < float(found.arrived) < 0.99
     narrow = psf(system, DRT(rays=2000), grid=grid(0.005, 3, centre=centroid[:, None]), **options)
     assert float(narrow.energy) < 0.5 * float(narrow.arrived)
+
+
+@pytest.mark.parametrize("model", [Gaussian(order=8), DRT(order=2), Wave(order=0), DRT(rays=500)])
+@pytest.mark.parametrize("x", [0.0, 3.0])
+def test_the_light_outside_a_window_is_what_arrives_elsewhere(model, x):
+    """Of a lens that clips the beam; x = 0: the light is symmetric, and half of it is traced."""
+    options = {"fields": vector(x, 6.0)[:, None], "object_distances": vector(25e3), "wavelengths": vector(0.55)}
+    narrow = psf(clipped(), model, pixel=0.02, size=5, **options)
+    if not isinstance(model, Wave):
+        whole = psf(clipped(), model, pixel=1.0, size=21, **options)
+        rounding = 2e-4 if isinstance(model, DRT) and model.order else 1e-9  # cells of another width
+        assert float(narrow.arrived) == pytest.approx(float(whole.energy), rel=rounding)
+    clear = psf(clipped(), DRT(rays=20_000), pixel=1.0, size=21, **options).energy
+    assert float(narrow.arrived) == pytest.approx(float(clear), abs=1e-2 if model.rays else 1e-3)
+    assert float(narrow.energy_outside) == pytest.approx(1 - float(narrow.energy / narrow.arrived), abs=1e-12)
+    assert 0.01 < float(narrow.energy_outside) < 0.9
 
 
 def test_psf_counts_vignetting_factors():

@@ -7,6 +7,7 @@ radius in µm, of the refocused lens at precision grade.
 """
 
 import argparse
+import csv
 import time
 import warnings
 from collections.abc import Iterator
@@ -153,23 +154,46 @@ def table_of_samples(store: Store, name: str, reference: int = 6000) -> list[str
     return lines
 
 
-def table_of_conditions(store: Store) -> Iterator[str]:
-    """A row for each condition: expected and nominal spot of the usual lens, their changes by the term, in percent."""
-    for title, case in CONDITIONS.items():
+def rows_of_conditions(store: Store) -> Iterator[dict]:
+    """Spots of the usual and of the robust lens of each condition, µm: nominal, and of the trials."""
+    for title, case in (CASES | CONDITIONS).items():
         key = "".join(c if c.isalnum() else "_" for c in title)
         ends = store.arrays(key, lambda case=case: desensitised(*case))
-        spots = []
         for end, numbers in ends.items():
             lens = lens_of(start_of(*case[:3])[0], numbers)
-            found = store.arrays(f"{key}_{end}_trials", lambda lens=lens: judged(lens))
-            spots.append((np.sqrt((found["trials"] ** 2).mean()), float(found["nominal"])))
-        changes = [f"{100 * (new / old - 1):+.1f} %" for old, new in zip(*spots, strict=True)]
-        yield " | ".join([f"| {title}", f"{case[4]:g}", *(f"{spot:.2f}" for spot in spots[0]), *changes]) + " |"
+            judgement = store.arrays(f"{key}_{end}_trials", lambda lens=lens: judged(lens))
+            trials = judgement["trials"]
+            yield {
+                **dict(zip(("lens", "f_number", "field"), case, strict=False)),
+                "weight": case[4],
+                "lens_of": end,
+                "nominal": float(judgement["nominal"]),
+                "root_mean_square": float(np.sqrt((trials**2).mean())),
+                "mean": float(trials.mean()),
+                "below_90": float(np.quantile(trials, 0.9)),
+            }
+
+
+def table_of_conditions(rows: list[dict]) -> Iterator[str]:
+    """A row for each condition: nominal spot and those of the trials of the usual lens, their changes by the term."""
+    for usual, robust in zip(rows[::2], rows[1::2], strict=True):
+        columns = ("nominal", "root_mean_square", "mean", "below_90")
+        cells = [f"{usual[name]:.2f}, {100 * (robust[name] / usual[name] - 1):+.1f} %" for name in columns]
+        condition = f"{usual['lens']}, F/{usual['f_number']:g}, {usual['field']:g}°"
+        yield " | ".join([f"| {condition}", f"{usual['weight']:g}", *cells]).replace("-", "−") + " |"
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="figures computed so far")
     parser.add_argument("--plot", type=Path, help="figure to write")
+    parser.add_argument("--csv", type=Path, help="spots of all conditions, as CSV")
     parser.add_argument("--only", choices=[*CASES, "samples", "conditions"], help="one part")
 
 
@@ -183,8 +207,10 @@ def main() -> None:
         for name in ("cooke_triplet", "double_gauss"):
             print("\n".join(table_of_samples(store, name)))
     if arguments.only in (None, "conditions"):
-        for line in table_of_conditions(store):
-            print(line, flush=True)
+        rows = list(rows_of_conditions(store))
+        print("\n".join(table_of_conditions(rows)))
+        if arguments.csv:
+            write_csv(arguments.csv, rows)
     figure = new_figure(9.0, 3.4 * len(CASES))
     panels = figure.subplots(len(CASES), 3, width_ratios=(1, 1, 1.1))
     for row, (title, case) in zip(panels, CASES.items(), strict=True):

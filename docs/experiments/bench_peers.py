@@ -218,7 +218,7 @@ def psf_methods(truth: Truth) -> list[Method]:
         kernel, count = compute(optic, field, wavelength, grid, *sizes)
         kernel = torch.as_tensor(np.ascontiguousarray(kernel) * (energy / kernel.sum()))
         unknown = kernel.new_full((3,), torch.nan)
-        return Kernels(kernel, grid, unknown[:2], unknown, count)
+        return Kernels(kernel, grid, unknown[:2], unknown, count, unknown[0])
 
     methods = []
     for model, against, compute, sampling, choices in _PSFS:

@@ -2,7 +2,7 @@
 
     python docs/experiments/bench_psf.py --docs FOLDER
 
-docs/speed_vs_error.md quotes the targets; all rows are in docs/speed_vs_error.csv. Random rays are brought to an error
+docs/compare.md quotes the targets; all rows are in docs/speed_vs_error.csv. Random rays are brought to an error
 of 1 %, direct Huygens sums to 1e-3; numbers of rays that would take too long are extrapolated.
 """
 
@@ -129,11 +129,11 @@ def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int = PIECE
     sampling = functools.partial(random, generator=generator)
     sizes = [min(piece, count - first) for first in range(0, count, piece)]
     parts = [drt.kernels_of_rays(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
-    centroid, covariance, kernel = (
+    centroid, covariance, kernel, arrived = (
         sum(size / count * values for size, values in zip(sizes, column, strict=True))
-        for column in zip(*((part.centroid, part.covariance, part.kernel) for part in parts), strict=True)
+        for column in zip(*((part.centroid, part.covariance, part.kernel, part.arrived) for part in parts), strict=True)
     )
-    return Kernels(kernel, grid, centroid, covariance, count)
+    return Kernels(kernel, grid, centroid, covariance, count, arrived)
 
 
 def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Speed and error of the trace and of Optiland over the number of rays: tables of docs/bench_trace.md.
+"""Speed and error of the trace and of Optiland over the number of rays: tables of docs/speed.md.
 
     NUMBA_NUM_THREADS=1 python docs/experiments/bench_trace.py --docs FOLDER
 

@@ -1,6 +1,7 @@
 """Which aperture wins at equal light: F/numbers with shot and read noise at a fixed exposure, by five PSF models.
 
     python docs/experiments/camera_aperture.py --data DIR -o FOLDER --docs docs
+    python docs/experiments/camera_aperture.py --table docs/camera_aperture.csv    # table and counts of stored rows
 
 Scene and exposure time are fixed: the electrons of a pixel are proportional to the solid angle of its beam, which the
 semi-diameters of the file clip. At every F/number each model moves the sensor to the least mean square error of
@@ -47,6 +48,7 @@ DEPTHS, SENSORS, PATCHES, SEEDS = 5, 9, 12, 5
 ORDERS = {"paraxial": 0, "fourier": -1, "gaussian": 4, "drt": 0, "wave": -1}
 FIRST_ORDER = "paraxial", "fourier"
 WAVES_FROM = 2.8  # F/number from which the PSFs of waves are computed off the axis
+LEVEL = 0.1  # dB of PSNR, difference up to which two F/numbers are level
 
 
 def clipped(name: str) -> Lens:
@@ -232,12 +234,30 @@ def table(rows: list[dict]) -> str:
         judge = found["wave"]
         best = seeds_of(judge[chosen["wave"]])
         words = [name, depth, light, *(f"F/{chosen[m]:g}" for m in models), f"{np.mean(best):.2f}"]
-        for model in models[:-1]:
-            lost = [b - a for a, b in zip(seeds_of(judge[chosen[model]]), best, strict=True)]
+        for model, lost in losses(found).items():
             middle, width = interval(lost)
             words.append("0" if chosen[model] == chosen["wave"] else f"{middle:.2f} ± {width:.2f}")
         lines.append("| " + " | ".join(words) + " |")
     return "\n".join(lines)
+
+
+def losses(curves_of_scene: dict[str, dict[float, dict]]) -> dict[str, list[float]]:
+    """PSNR of restored pictures at the F/number of waves less that at the F/number of each model, dB, by seed."""
+    judge = curves_of_scene["wave"]
+    best = seeds_of(judge[winner(judge)])
+    choices = {model: winner(curve) for model, curve in curves_of_scene.items() if model != "wave"}
+    return {model: [b - a for a, b in zip(seeds_of(judge[n]), best, strict=True)] for model, n in choices.items()}
+
+
+def counts(rows: list[dict]) -> str:
+    """Scenes in which the F/number of a model loses at most `LEVEL` to that of waves, and those in which the two best
+    F/numbers of waves are level."""
+    scenes = [curves(rows, *scene) for scene in dict.fromkeys((r["lens"], r["depth"], r["light"]) for r in rows)]
+    level = {model: sum(np.mean(losses(scene)[model]) <= LEVEL for scene in scenes) for model in [*ORDERS][:-1]}
+    expected = [sorted(decibel(row["error"]) for row in scene["wave"].values())[-2:] for scene in scenes]
+    ties = sum(best - second <= LEVEL for second, best in expected)
+    words = ", ".join(f"{model} {count}" for model, count in level.items())
+    return f"level with waves to {LEVEL:g} dB in {words} of {len(scenes)} scenes; waves undecided in {ties}"
 
 
 def figure(rows: list[dict]):
@@ -268,6 +288,14 @@ def figure(rows: list[dict]):
     return drawn
 
 
+def stored(file: Path) -> list[dict]:
+    """Rows that `save` wrote."""
+    with open(file, newline="", encoding="utf-8") as lines:
+        rows = [{key: text for key, text in row.items() if text} for row in csv.DictReader(lines)]
+    words = "lens", "depth", "light", "model"
+    return [{key: text if key in words else float(text) for key, text in row.items()} for row in rows]
+
+
 def save(rows: list[dict], stem: Path) -> None:
     columns = [*dict.fromkeys(key for row in rows for key in row)]
     with open(stem.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
@@ -278,9 +306,11 @@ def save(rows: list[dict], stem: Path) -> None:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", required=True, help="folder of pictures")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--data", help="folder of pictures")
+    source.add_argument("--table", type=Path, help="stored rows: print their table and counts, compute nothing")
     parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
-    parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
+    parser.add_argument("-o", dest="folder", type=Path, default=Path("."), help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
 
 
@@ -288,6 +318,10 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options(parser)
     chosen = parser.parse_args(words)
+    if chosen.table:
+        rows = stored(chosen.table)
+        print(table(rows), counts(rows), sep="\n")
+        return
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", UnfilledStop)
     rt.tracing.prepare()
@@ -310,7 +344,7 @@ def main(words: list[str] | None = None) -> None:
                     print(paths[0].name, flush=True)
                 errors = read_json(paths[1])
                 rows += [{**row, **errors[row["light"]]} if row["model"] == "wave" else row for row in of_case]
-    print(table(rows))
+    print(table(rows), counts(rows), sep="\n")
     if chosen.docs:
         save(rows, chosen.docs / "camera_aperture")
 

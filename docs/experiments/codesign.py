@@ -82,7 +82,7 @@ _TIME_COLUMNS = ("model", "psf_ms", "image_ms", "network_ms")
 _CLAIM_COLUMNS = ("claim", "answer", "figures", "criterion")
 _COMMAND = "python docs/experiments/codesign.py"
 _PAPER_NOTE = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
-_SWEEP = " At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
+_SWEEP = " At other apertures, ρ, noise, normalisations and distances: [sweep.csv](codesign/sweep.csv)."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,8 +171,8 @@ def _answer(report: Report) -> str:
     if report.is_of_paper:
         holds = sum(claim.answer == "yes" for claim in report.claims)
         text += (
-            f" Of the {len(report.claims)} claims of the paper {holds} hold: [claims.csv]({report.folder}/claims.csv); "
-            "all readings: [codesign_readings.md](codesign_readings.md#the-papers-claims)."
+            f" Of {len(report.claims)} criteria for the claims of the paper {holds} are met: "
+            f"[claims.csv]({report.folder}/claims.csv); which of them decide: [papers.md](papers.md)."
         )
     return text
 

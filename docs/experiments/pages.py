@@ -1,6 +1,7 @@
 """Pages of results in Markdown: measurements are rewritten, text below the mark is kept."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -62,8 +63,8 @@ def yes(fact: bool | None, none: str = "–") -> str:
 
 
 def picture(place: str, caption: str) -> str:
-    """A figure with its caption below it."""
-    return f"![{caption}]({place})\n\n*{caption}*"
+    """A figure with its caption below it; the caption up to its first punctuation mark in place of the figure."""
+    return f"![{re.split('[,;:.]', caption)[0]}]({place})\n\n*{caption}*"
 
 
 def shown(value: float, digits: int) -> str:

@@ -2,7 +2,7 @@
 from the best spots.
 
     python docs/experiments/second_order.py            # runs what is missing in docs/second_order.csv, a row a run
-    python docs/experiments/second_order.py --table    # prints the table of docs/loss.md
+    python docs/experiments/second_order.py --table    # prints the table of docs/reference/loss.md
 
 Every run starts at a lens whose free numbers are displaced at random. The loss is the mean square error of a pixel of
 5 µm behind a Wiener filter, of scenes of a 1/f² spectrum and noise of 0.02, from the geometric transfer functions of

@@ -611,8 +611,9 @@ def _parts(found: OverNoise, elements: Mapping[str, Element], command: str) -> l
         f"{counted(found.pictures, found.classes)}; filters are made for others.",
         picture("wave/noise.png", f"Gain on {shown}, errors pooled over pictures; bands: 95 % intervals over classes."),
         picture("wave/gain.png", f"Gain at noise {_noise_of(found):g}; bars: 95 % intervals over classes."),
-        *(part for filter in FILTERS for part in _table(found, shown, filter)),
-        "All contents, both means, PSNR and the range of the random starts: [noise.csv](wave/noise.csv).",
+        *_table(found, shown, "wiener"),
+        "The best depth-invariant filter, all contents, both means, PSNR and the range of the random starts: "
+        "[noise.csv](wave/noise.csv).",
         *_again(found, list(elements)),
     ]
 

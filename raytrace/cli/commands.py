@@ -300,6 +300,7 @@ COMMANDS = (
         cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
         triplet.zmx --insert 2 4 -o four_elements
         double_gauss --merit spot --vary curvature thickness --hold efl=100 --edge 1 --delete -o fewer
+        phone_plates --kind phone --hold efl=6 -o phone
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
         *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
         group(
@@ -310,6 +311,8 @@ COMMANDS = (
             Option("delete", count, "SURFACE", "instead of starts: remove each element, or those of these first "
                 "surfaces, flattened and thinned while the rest follows", nargs="*"),
             "seconds",
+            Option("kind", None, "KIND", "phone: from plates of plastic to a wide and fast lens of aspheres, in steps",
+                choices=("phone",)),
             row("seed", "of starts and hops"),
         ),
         plot("the best lenses side by side"),

@@ -52,13 +52,16 @@ from torch import Tensor, nn
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
 from raytrace.imaging.field_kernels import (
     ElementKernels,
+    EnergyOutside,
     FieldKernels,
+    KernelSum,
     Model,
     Normalisation,
     by_angle,
     check_model,
     check_points,
     has_points,
+    of_sum_1,
     order_of,
     warn_of_dark_places,
 )
@@ -76,17 +79,19 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.table import ToleranceTable
+from raytrace.tracing.geometry import Unbuildable, defects
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.plan import plan as sampling_plan
-from raytrace.words import named_value
+from raytrace.words import calling_level, named_value
 
 #: The variables of a camera: of a lens, or of a phase element without one.
 V = TypeVar("V", bound=Variables | PhaseVariables)
 
 _NEAREST = 0.01  # of the nearest object distance of a camera: nearer ones are meant in another unit
+_OUTSIDE = 0.1  # of the light outside the window, which kernels of sum 1 hide
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
@@ -107,8 +112,9 @@ class Camera(nn.Module, Generic[V]):
     and of 1 of its half diagonal, whose images stay at these points of it; without a sensor the axis.
     pixels: of the sensor across the PSF window, an odd number, 21 by default.
     center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): a displaced image is no
-    error. normalise: "window" (PSFs of sum 1) or "energy" (of the share of the light through the entrance pupil); with
-    elements alone also "haze": "energy", and the light beyond the window is spread evenly over the image.
+    error. normalise: "window" (PSFs of sum 1; `energy_outside` is the share of the light that they leave out) or
+    "energy" (of the share of the light through the entrance pupil); with elements alone also "haze": "energy", and the
+    light outside the window is spread evenly over the image.
     boundary: of pictures, as for `blur`: "valid", images are smaller by `margin`; "circular", pictures are periods of
     an endless one; or they are extended. illumination: images have the relative illumination of their places, too.
     filter: of elements alone, a linear filter of the image before the network, that follows from the kernels of its
@@ -120,7 +126,8 @@ class Camera(nn.Module, Generic[V]):
     each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
     compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
-    its variables and the sensor, and loads only into a camera with the same ones.
+    its variables and the sensor, and loads only into a camera with the same ones; it holds the order of the PSF model
+    and the curvature of `lens_step`, so that a resumed training is bit-identical.
     Warns UnfilledStop once, for the lens at construction.
     """
 
@@ -177,6 +184,7 @@ class Camera(nn.Module, Generic[V]):
         self.tol, self.network_dtype, self.tolerances = tol, network_dtype, tolerances
         self.use(model or ("wave" if self.elements() else "gaussian"))
         self._memo = Memo(object_distances=object_distances)
+        self._has_warned = self._is_unbuildable = False  # EnergyOutside and Unbuildable are each said once
 
     def _check_element(self) -> None:
         """Refuse options of the other kind of camera, with a lens or without. Raises ValueError, TypeError."""
@@ -267,13 +275,21 @@ class Camera(nn.Module, Generic[V]):
         loss: a function without arguments, as
         lambda: (camera(pictures, distances, index=index) - camera.target(pictures)).square().mean(). It is called at
         trial lenses, too: give `index`, so that all have the same noise. The step is within the bounds and meets the
-        conditions of the variables, without `project`; an optimiser of the network takes its steps in between.
+        conditions of the variables, without `project`; an optimiser of the network takes its steps in between. Warns
+        Unbuildable once where a step leads to a lens that cannot be made, as the loss and the conditions allow it.
         """
         if not isinstance(self.variables, Variables):
             raise ValueError("lens_step: the camera has a phase element without a lens; take a step of its heights")
         if self._steps is None:
             self._steps = LensSteps(self.variables)
-        return self._steps.step(loss)
+        before = self._steps.step(loss)
+        if not self._is_unbuildable and (defect := next(iter(defects(self.variables())), None)):
+            self._is_unbuildable = True
+            advice = "give Variables(…, hold='buildable'), or add camera.variables.violation() to the loss"
+            warnings.warn(
+                f"{defect}; no limit of thicknesses is met: {advice}", Unbuildable, stacklevel=calling_level()
+            )
+        return before
 
     def __getstate__(self) -> dict:
         """The state without the last steps of the lens, of which only the next step would know."""
@@ -296,10 +312,28 @@ class Camera(nn.Module, Generic[V]):
         }
 
     def get_extra_state(self) -> Tensor:
-        return encoded_text(self.description())
+        """The description, the sampling of the PSFs as `plan` fixed it, and the curvature that `lens_step` knows."""
+        return encoded_text(
+            {
+                **self.description(),
+                "order": self._order,
+                "sampling": self._sampling and dataclasses.asdict(self._sampling),
+                "lens_steps": self._steps and self._steps.memory(),
+            }
+        )
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Does nothing: a state is compared before it is loaded."""
+        """Resume with the sampling of the PSFs and the steps of the lens of the state, which was compared before.
+
+        An order that the parameters of the PSF model give remains.
+        """
+        stored = decoded_text(state)
+        if stored["model"] == self.model and getattr(self.psf_parameters, "order", None) is None:
+            self._order = stored.get("order", self._order)
+        if sampling := stored.get("sampling"):
+            self._sampling = Plan(**{**sampling, "band": tuple(sampling["band"])})
+        memory = stored.get("lens_steps")
+        self._steps = None if memory is None else LensSteps(self.variables, memory)
 
     def _load_from_state_dict(
         self, state_dict: dict, prefix: str, local_metadata: dict, strict: bool, missing: list[str], *lists: list[str]
@@ -385,9 +419,65 @@ class Camera(nn.Module, Generic[V]):
         object_distances: a tensor, a sequence or one number. field: number of one of the camera's `fields`, or (B,)
         numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N);
         the object points are those that the nominal lens images at these places. PSFs are 0 where no light arrives,
-        with the warning DarkPlaces. draw: of an element alone, generator of errors of fabrication. Raises ValueError
-        for points that are not finite.
+        with the warning DarkPlaces. Of PSFs of sum 1, EnergyOutside warns once, where more than 10 % of the light is
+        outside the window. draw: of an element alone, generator of errors of fabrication. Raises ValueError for points
+        that are not finite.
         """
+        is_of_sum_1 = self.normalise == "window"
+        kernels, lens, points = self._kernels(
+            object_distances, field, errors, points, "arrived" if is_of_sum_1 else self.normalise, draw
+        )
+        if is_of_sum_1:
+            self._warn_of_energy_outside(kernels.detach().sum((-2, -1)))
+            kernels = of_sum_1(kernels)
+        if points is None and (self.illumination or bool((kernels.detach() == 0).all((1, 2, 3)).any())):
+            points = self.sensor.landing(lens, self._of_field(self.fields, field, len(kernels)))
+        if points is not None:
+            warn_of_dark_places(kernels, points)
+        if self.illumination and points is not None:
+            kernels = kernels * illumination_at(lens, self.sensor, points)[:, None, None, None]
+        return kernels
+
+    def energy_outside(
+        self,
+        object_distances: Tensor | Sequence[float] | float,
+        field: int | Sequence[int] = 0,
+        errors: Tensor | None = None,
+        *,
+        points: Tensor | None = None,
+    ) -> Tensor:
+        """Shares (B, C) of the light on the sensor plane that are outside the windows of PSFs; arguments as for
+        `kernels`.
+
+        Differentiable, as for a penalty in a training. Light that is vignetted does not count; 1 where none arrives.
+        """
+        kernels = self._kernels(object_distances, field, errors, points, "arrived")[0]
+        return (1 - kernels.sum((-2, -1))).clamp_min(0.0)
+
+    def _warn_of_energy_outside(self, inside: Tensor) -> None:
+        """Warn once of windows with a share (B, C) of the light, of which they hold too little."""
+        least = float(torch.where(inside > 0, inside, 1.0).min())  # DarkPlaces warns of 0
+        if least > 1 - _OUTSIDE or self._has_warned:
+            return
+        self._has_warned = True
+        warnings.warn(
+            f"{100 * (1 - least):.0f} % of the light are outside the PSF window of {self.size} pixels, and kernels of "
+            "sum 1 leave them out: focus the lens, give more pixels, or normalise='energy'; camera.energy_outside(…) "
+            "gives the share",
+            EnergyOutside,
+            stacklevel=calling_level(),
+        )
+
+    def _kernels(
+        self,
+        object_distances: Tensor | Sequence[float] | float,
+        field: int | Sequence[int],
+        errors: Tensor | None,
+        points: Tensor | None,
+        normalise: KernelSum,
+        draw: torch.Generator | None = None,
+    ) -> tuple[Tensor, Lens, Tensor | None]:
+        """PSFs as of `kernels`, of other sums, without illumination; the lens; points of the sensor, if known."""
         distances, nominal = self._distances(object_distances), self.lens()
         lens, count = nominal, len(distances)
         if points is None and self.points is not None:
@@ -412,9 +502,9 @@ class Camera(nn.Module, Generic[V]):
                 elements=self.elements(),
                 parameters=self.psf_parameters,
                 center=self.center,
-                normalise=self.normalise,
                 memo=self._memo if points is None and errors is None else None,
             )
+        about = dataclasses.replace(about, normalise=normalise)
         if isinstance(about, ElementKernels):  # alike at all places
             kernels = about.paired(self.fields)
         elif errors is None and points is not None:
@@ -431,13 +521,7 @@ class Camera(nn.Module, Generic[V]):
             arrives = ~fields.isnan().any(0)
             kernels = about.of_pairs(fields.nan_to_num(0.0))
             kernels = torch.where(arrives[:, None, None, None], kernels, 0.0)
-        if points is None and (self.illumination or bool((kernels.detach() == 0).all((1, 2, 3)).any())):
-            points = self.sensor.landing(lens, self._of_field(self.fields, field, count))
-        if points is not None:
-            warn_of_dark_places(kernels, points)
-        if self.illumination and points is not None:
-            kernels = kernels * illumination_at(lens, self.sensor, points)[:, None, None, None]
-        return kernels
+        return kernels, lens, points
 
     @staticmethod
     def _of_field(places: Tensor, field: int | Sequence[int], count: int) -> Tensor:

@@ -57,6 +57,8 @@ from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
 #: Kernels have the sum 1 ("window"), or the share of all light: the rest is lost ("energy"), or an even haze ("haze").
 Normalisation: TypeAlias = Literal["window", "energy", "haze"]
+#: The same, or the share of the light on the sensor plane ("arrived"): the rest is outside the window.
+KernelSum: TypeAlias = Normalisation | Literal["arrived"]
 #: A PSF model with its numbers.
 Model: TypeAlias = Paraxial | Fourier | Gaussian | DRT | Wave
 
@@ -80,6 +82,10 @@ class DarkPlaces(RaytraceWarning):
     """Places of the sensor without light, whose kernels are 0."""
 
 
+class EnergyOutside(RaytraceWarning):
+    """Kernels of sum 1 leave out much light, outside their window."""
+
+
 @dataclasses.dataclass(frozen=True)
 class FieldKernels:
     """Kernels at places of the sensor.
@@ -89,8 +95,8 @@ class FieldKernels:
     where their chief rays meet the sensor, or about the origin; nodes: radii of the Gaussian model at which rays are
     traced; elements: in contact at the stop, with the model "wave"; parameters: of the model, as Paraxial(rho=0.4), or
     Gaussian(rays=points), pupil points in place of an order; center: of the window, "chief" or "centroid" (of the
-    light); normalise: "window", kernels of sum 1, or of the share of the light through the entrance pupil;
-    memo: of rays, for loops over the same field points. Raises ValueError for elements and another model.
+    light); normalise: "window", kernels of sum 1, of the share of the light through the entrance pupil, or of the light
+    that arrives; memo: of rays, for loops over the same field points. Raises ValueError for elements and another model.
     """
 
     lens: Lens
@@ -105,7 +111,7 @@ class FieldKernels:
     elements: tuple[Element, ...] = ()
     parameters: Model | None = None
     center: Literal["chief", "centroid"] = "chief"
-    normalise: Normalisation = "window"
+    normalise: KernelSum = "window"
     memo: Memo | None = None
 
     def __post_init__(self) -> None:
@@ -170,9 +176,10 @@ class FieldKernels:
 
     @property
     def _has_radii(self) -> bool:
-        """Whether all azimuths of a radius have the same moments, about the chief ray, in kernels of sum 1."""
-        how = self.center, self.normalise, has_points(self.parameters)
-        return self.model == "gaussian" and how == ("chief", "window", False) and is_round_about_axis(self.lens)
+        """Whether all azimuths of a radius have the same moments, about the chief ray, whatever light is vignetted."""
+        is_centred = self.center == "chief" and self.normalise in ("window", "arrived")
+        is_centred = is_centred and not has_points(self.parameters)
+        return self.model == "gaussian" and is_centred and is_round_about_axis(self.lens)
 
     @property
     def _model(self) -> Model:
@@ -219,34 +226,36 @@ class FieldKernels:
             if of_points and MODELS[self.model].in_common and not varies(part):
                 # Field points that vary break symmetry: one sampling, with derivatives or not.
                 part = part.detach().requires_grad_()
-            light = self.light(part, origin) if self.elements else self._of_model(part, origin)
-            light = torch.einsum("cw,dfwij->fdcij", self.weights.to(light), light).flip(-1)
-            kernels.append(_of_sum_1(light) if self.normalise == "window" else light)
+            light, arrived = self.light(part, origin) if self.elements else self._of_model(part, origin)
+            weights = self.weights.to(light)
+            light = torch.einsum("cw,dfwij->fdcij", weights, light).flip(-1)
+            kernels.append(_normalised(light, torch.einsum("cw,dfw->fdc", weights, arrived), self.normalise))
         return torch.cat(kernels)
 
-    def _of_model(self, fields: Tensor, origin: Tensor) -> Tensor:
-        """Light (D, F, W, h, w), columns towards +x; 1 = all through the entrance pupil."""
+    def _of_model(self, fields: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
+        """Light (D, F, W, h, w), columns towards +x, and that on the whole sensor plane (D, F, W); 1 = all through the
+        entrance pupil."""
         numbers = pytree.tree_leaves((self.lens, self.object_distances))
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(map(varies, numbers))):
-            light = [
+            psfs = [
                 psf(
                     self.lens, self._model, fields=fields, wavelengths=wavelengths, per_wavelength=True, grid=window,
                     object_distances=self.object_distances, center="axis" if self.center == "chief" else "centroid",
                     execution=Execution(memo=self.memo),
-                ).kernel
+                )
                 for wavelengths, window in self._windows(origin)
             ]  # fmt: skip
-            return torch.cat(light, 2)
+            return torch.cat([part.kernel for part in psfs], 2), torch.cat([part.arrived for part in psfs], 2)
 
-    def light(self, fields: Tensor, origin: Tensor) -> Tensor:
-        """Light (D, F, W, h, w) in each pixel for fields (2, F) of a lens with elements; 1 = all through the pupil."""
+    def light(self, fields: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
+        """`_of_model` of fields (2, F) of a lens with elements."""
         kernels = []
         for wavelengths, window in self._windows(origin):
             view = scene(self.lens, fields, self.object_distances, wavelengths)
             centre = window.centre[..., None].expand(2, *view.shape)
             window = dataclasses.replace(window, centre=centre)
-            kernels.append(hybrid.kernels(view, self.elements, window, order=self.order).kernel)
-        return torch.cat(kernels, 2)
+            kernels.append(hybrid.kernels(view, self.elements, window, order=self.order))
+        return torch.cat([part.kernel for part in kernels], 2), torch.cat([part.arrived for part in kernels], 2)
 
     def _windows(self, origin: Tensor) -> Iterator[tuple[Tensor, Grid]]:
         """Wavelengths with a common origin, µm, and their pixels about it, whose centres are (2, D, F)."""
@@ -298,7 +307,9 @@ class FieldKernels:
                 covariance = torch.stack([sagittal[:, some] * a + tangential[:, some] * b for a, b in pairs])
                 centroid = torch.stack([x * shift[:, some], y * shift[:, some]])
                 part = light[:, some, :, None, None] * pixels(window, centroid, covariance)  # (D, N, W, size, size)
-                part = _of_sum_1(torch.einsum("cw,dfwij->fdcij", self.weights.to(part), part))
+                weights = self.weights.to(part)
+                arrived = torch.einsum("cw,dfw->fdc", weights, light[:, some])
+                part = _normalised(torch.einsum("cw,dfwij->fdcij", weights, part), arrived, self.normalise)
                 kernels.append(torch.nn.functional.pad(part, [(self.size - size) // 2] * 4))
                 order.append(some)
         return torch.cat(kernels)[torch.cat(order).argsort()]
@@ -345,7 +356,7 @@ class ElementKernels:
     object_distances: Tensor
     weights: Tensor
     exact: bool = False
-    normalise: Normalisation = "window"
+    normalise: KernelSum = "window"
     plan: Plan | None = None
     memo: Memo | None = None
 
@@ -368,7 +379,7 @@ class ElementKernels:
     def of_light(self, light: Tensor) -> Tensor:
         """Kernels (D, C, size, size) of `light`."""
         kernels = (self.weights.to(light) @ light.flatten(2)).unflatten(2, light.shape[2:]).flip(-1)
-        return _of_sum_1(kernels) if self.normalise == "window" else kernels
+        return of_sum_1(kernels) if self.normalise == "window" else kernels
 
     def at(self, points: Tensor) -> Tensor:
         """Kernels (N, D, C, size, size) at places (2, N) mm of the sensor."""
@@ -480,9 +491,16 @@ def along(radii: Tensor, curve: Tensor, points: Tensor) -> Tensor:
     return (1 - part) * curve[left] + part * curve[left + 1]
 
 
-def _of_sum_1(kernels: Tensor) -> Tensor:
+def of_sum_1(kernels: Tensor) -> Tensor:
     """Kernels (..., h, w) over their sums; 0 without light."""
     return safe_divide(kernels, kernels.sum((-2, -1), keepdim=True))
+
+
+def _normalised(light: Tensor, arrived: Tensor, normalise: KernelSum) -> Tensor:
+    """Kernels (..., h, w) of light, of which (...) arrives on the whole sensor plane."""
+    if normalise == "window":
+        return of_sum_1(light)
+    return safe_divide(light, arrived[..., None, None]) if normalise == "arrived" else light
 
 
 def check_points(points: Tensor, count: int) -> None:
@@ -500,8 +518,8 @@ def warn_of_dark_places(kernels: Tensor, points: Tensor) -> None:
     if bool(dark.any()):
         x, y = min(points.detach()[:, dark].T.tolist(), key=lambda point: math.hypot(*point))
         warnings.warn(
-            f"{int(dark.sum())} of {len(dark)} places of the sensor receive no light, and their kernels are 0: the "
-            f"nearest to the axis is ({x:.4g}, {y:.4g}) mm; give a sensor within the image circle",
+            f"{int(dark.sum())} of {len(dark)} places of the sensor receive no light in the window, and their kernels "
+            f"are 0: the nearest to the axis is ({x:.4g}, {y:.4g}) mm; give a sensor within the image circle",
             DarkPlaces,
             stacklevel=calling_level(),
         )
@@ -561,7 +579,7 @@ def _window_of_elements(
             light = kernels.light()
         else:
             parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
-            light = torch.cat([part.light(fields, part.origin(fields)) for part in parts])
+            light = torch.cat([part.light(fields, part.origin(fields))[0] for part in parts])
         edge = (larger - size) // 2
         inner, outer = (part.sum((-2, -1)) for part in (light[..., edge:-edge, edge:-edge], light))
         if bool((outer - inner <= _TAIL * outer).all()):

@@ -21,9 +21,12 @@ from raytrace.optimization.problem import Problem, typical_of
 
 
 class LensSteps:
-    """Steps of the parameters of `Variables`; those that need no gradient do not move."""
+    """Steps of the parameters of `Variables`; those that need no gradient do not move.
 
-    def __init__(self, variables: Variables):
+    memory: of earlier steps, which are resumed.
+    """
+
+    def __init__(self, variables: Variables, memory: dict | None = None):
         self.variables, self.damping = variables, OPTIONS.damping
         rows = DefaultMerit("spot").rows(variables.free.lens)
         self.problem = Problem(variables.free, rows, variables.held_to)
@@ -32,6 +35,13 @@ class LensSteps:
         self._loss: Callable[[], Tensor] = lambda: torch.zeros(())
         self._last: tuple[bytes, Slope] | None = None
         self.lifted = Lifted(self._function, self._rows, self.typical)
+        if memory is not None:
+            self.damping = memory["damping"]
+            self.lifted.resume(memory)
+
+    def memory(self) -> dict:
+        """Damping, curvature and places of the last steps, as plain values for JSON, with which steps resume."""
+        return {"damping": self.damping, **self.lifted.memory()}
 
     @property
     def parameters(self) -> list[torch.nn.Parameter]:

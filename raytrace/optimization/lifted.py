@@ -168,6 +168,19 @@ class Lifted:
         self.places.clear()
         self.scale = None
 
+    def memory(self) -> dict:
+        """The scale of the curvature and the places of the pairs, as plain values for JSON."""
+        return {
+            "scale": self.scale,
+            "places": [[part.tolist() for part in (place.x, place.gradient, place.slope)] for place in self.places],
+        }
+
+    def resume(self, memory: dict) -> None:
+        """Continue with the curvature of a `memory`."""
+        self.scale = memory["scale"]
+        for x, gradient, slope in memory["places"]:
+            self.places.append(_Place(np.array(x), np.array(gradient), np.array(slope).reshape(-1, len(x))))
+
     def displaced(self, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Variables from x in a random direction, as far as makes a blur of the RMS spot."""
         blur, spot = self._metric(self.rows(x, True))

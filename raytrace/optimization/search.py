@@ -29,6 +29,7 @@ from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.optimization.attained import conditions_attained
 from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.contradictions import refuse_contradictions
+from raytrace.optimization.curriculum import Growth, Plan
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
@@ -79,6 +80,7 @@ if TYPE_CHECKING:
 STOPPED = {
     "starts": "all starts were tried",
     "surfaces": "all moves from the lens were followed",
+    "steps": "all steps were taken",
     "seconds": "the limit on time was reached",
     "interrupted": "interrupted; these were found so far",
 }
@@ -349,6 +351,7 @@ _DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.valu
 def search(
     lens: Lens,
     *,
+    kind: str | None = None,
     merit: str | Merit | DefaultMerit | Sequence[Row] | None = None,
     vary: str | Sequence[str] | None = None,
     bounds: str | Sequence[str] | None = None,
@@ -372,7 +375,9 @@ def search(
     which is that of `hold`, of a row EFFL or of the lens. starts: how many. Instead of starts, insert: True, or
     surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
     more (`saddle_points.py`); or delete: True, or first surfaces of elements, each of which is flattened and thinned
-    until it is gone, to lenses with one element less (`removal.py`). seconds: after which it ends; seed: of the draws.
+    until it is gone, to lenses with one element less (`removal.py`). kind: "phone", a curriculum from plates of plastic
+    to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its focal
+    length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
     as_built: `AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of the merit
     function alone, in the order of the merit with this term; of each lens with the tolerances of its own surfaces.
     loss, of, object_distances: as for `optimize`; the eight best minima are followed to minima of the loss, between the
@@ -392,37 +397,45 @@ def search(
     prepare()
     warn_of_filling(lens, field_points(None, like=lens))
     started = time.monotonic()
-    function = merit_for(lens, merit)
-    free = design_variables(lens, vary)
-    if any(variable.quantity == "glass" for variable in free.variables):
+    until = started + (np.inf if seconds is None else seconds)
+    given = [asked for asked in (kind, insert, delete) if asked is not None and asked is not False]
+    if len(given) + (starts is not None and kind is None) > 1:
+        raise NoProblem(
+            f"{option('starts')}, {option('insert')}, {option('delete')} and {option('kind')} exclude one another, but "
+            f"for {option('starts')} of {option('kind')}"
+        )
+    plan = None
+    if kind is not None:
+        plan = Plan(kind, lens, vary, bounds, hold, merit if isinstance(merit, DefaultMerit) else None)
+        task = plan.problem(lens, plan.curriculum.steps[0])
+        starts = plan.curriculum.starts if starts is None else starts
+    else:
+        function, free = merit_for(lens, merit), design_variables(lens, vary)
+        ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
+        glass, air = function.boundaries.glass, function.boundaries.air
+        task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
+    if any(variable.quantity == "glass" for variable in task.model.variables):
         raise NoProblem(
             f"{option('vary', 'glass')} is for optimize: search with the glasses as they are, then optimize what is "
             "found"
         )
-    glass, air = function.boundaries.glass, function.boundaries.air
-    ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
-    task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
-    until = started + (np.inf if seconds is None else seconds)
-    if conditions:
+    if task.conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
-    run: FromLens | _Run
-    given = [asked for asked in (starts, insert, delete) if asked is not None and asked is not False]
-    if len(given) > 1:
-        raise NoProblem(
-            f"{option('starts')}, {option('insert')} and {option('delete')} exclude one another: the last two begin at "
-            "the lens alone"
-        )
+    run: FromLens | Growth | _Run
     if insert is not None and insert is not False:
-        surfaces = surfaces_of(free, () if insert is True else tuple(insert))
+        surfaces = surfaces_of(task.model, () if insert is True else tuple(insert))
         journal = Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until)
         run = FromLens(task, journal, insertions(task, surfaces), len(SIDES) * len(surfaces), "insert")
     elif delete is not None and delete is not False:
-        elements = elements_of(free, conditions, () if delete is True else tuple(delete))
+        elements = elements_of(task.model, task.conditions, () if delete is True else tuple(delete))
         journal = Journal(folder, {**task.about(seed), "delete": list(elements)}, until)
         run = FromLens(task, journal, removals(task, elements), len(elements), "delete")
     else:
-        run = _Run(task, Journal(folder, task.about(seed), until), seed, STARTS if starts is None else starts)
+        about = task.about(seed) if plan is None else {**task.about(seed), "kind": kind}
+        journal = Journal(folder, about, until)
+        first = _Run(task, journal, seed, STARTS if starts is None else starts)
+        run = first if plan is None else Growth(plan, first, journal)
     stopped = run.DONE
     try:
         run.through(progress)

@@ -297,9 +297,9 @@ def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0)
     """
     *widths, both = cell_widths(grid, fans.points, scene.largest)
     fine = refined(fans, [math.ceil(cell * max(1 / width, both)) for cell in widths])
-    centroid, covariance = moments_of_fans(fans)
-    kernel = energy_of_fans(grid, fine) * beam_share(scene)[..., None, None]
-    return Kernels(kernel, grid, centroid, covariance, fans.rays)
+    kernel, light = energy_of_fans(grid, fine), beam_share(scene)
+    centroid, covariance, arrived = moments_of_fans(fans)
+    return Kernels(kernel * light[..., None, None], grid, centroid, covariance, fans.rays, arrived * light)
 
 
 def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
@@ -361,19 +361,22 @@ def cut_line(t: Tensor, parts: int) -> Tensor:
     return torch.cat([inner, t[..., -1:]], -1) if parts > 1 else t
 
 
-def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
-    """Centroid (2, D, F, W) mm and covariance (3, D, F, W) mm² of the energy of fans, before pixel integration."""
+def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor, Tensor]:
+    """Centroid (2, D, F, W) mm and covariance (3, D, F, W) mm² of the energy of fans, before pixel integration, and
+    that energy (D, F, W); all light through the pupil is 1."""
     reference = fans.points[..., :1, :1].detach()
     if fans.is_half:
         reference = torch.stack([torch.zeros_like(reference[0]), reference[1]])
     closed = not fans.is_half
     (x, ax, bx), (y, ay, by) = (cells(t, fans.radius, closed=closed) for t in fans.points - reference)
-    weights = cell_energy(fans.radius, x.shape[-2]) * clear_share(fans.clearances, fans.radius, closed=closed)
+    lines = x.shape[-2] - 1 if fans.is_half else x.shape[-2]
+    weights = cell_energy(fans.radius, lines) * clear_share(fans.clearances, fans.radius, closed=closed)
     weights = torch.as_tensor(weights).expand(x.shape)
     if fans.is_half:
         # All but the outer cells count twice.
         weights = torch.cat([0.5 * weights[..., :1, :], weights[..., 1:-1, :], 0.5 * weights[..., -1:, :]], -2)
-    share = safe_divide(weights, weights.sum((-2, -1), keepdim=True))
+    arrived = weights.sum((-2, -1))
+    share = safe_divide(weights, arrived[..., None, None])
     mean_x, mean_y = ((share * t).sum((-2, -1), keepdim=True) for t in (x, y))
     mean_x = torch.zeros_like(mean_x) if fans.is_half else mean_x
     x, y = x - mean_x, y - mean_y
@@ -382,7 +385,7 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     if fans.is_half:
         covariance = torch.stack([covariance[0], torch.zeros_like(covariance[1]), covariance[2]])
     centroid = torch.stack([mean_x, mean_y])[..., 0, 0] + reference[..., 0, 0]
-    return torch.where(weights.sum((-2, -1)) > 0, centroid, 0.0), covariance
+    return torch.where(arrived > 0, centroid, 0.0), covariance, arrived
 
 
 def kernels_of_points(
@@ -395,7 +398,7 @@ def kernels_of_points(
     light = beam_share(scene)
     kernel = deposit(grid, points, energy, width) * light[..., None, None]
     centroid, covariance = moments_of_rays(points, energy)
-    return Kernels(kernel, grid, centroid, covariance, rays, arrived=energy.sum(-1) * light)
+    return Kernels(kernel, grid, centroid, covariance, rays, energy.sum(-1) * light)
 
 
 @torch.no_grad()
@@ -445,8 +448,8 @@ def stream_kernels(
         k.unflatten(0, shape) * (light / count)[..., None, None] for k, count in ((images, rays), (before, half))
     )
     return (
-        Kernels(whole, grid, m.mean, covariance, rays, arrived=arrived),
-        Kernels(first, grid, m.mean, covariance, half, arrived=arrived),
+        Kernels(whole, grid, m.mean, covariance, rays, arrived),
+        Kernels(first, grid, m.mean, covariance, half, arrived),
     )
 
 
@@ -602,8 +605,10 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     each = 48.0 * (3 + len(ray_map.apertures))
     afford_cells(scene.shape, across // 2 if is_half else across, along, each=each)
     fans = fans_of_map(ray_map, across, along, is_half=is_half)
-    kernel = energy_of_fans(grid, fans) * beam_share(scene)[..., None, None]
-    return _with_residual(Kernels(kernel, grid, *moments_of_fans(fans), ray_map.rays), ray_map.residual)
+    kernel, light = energy_of_fans(grid, fans), beam_share(scene)
+    centroid, covariance, arrived = moments_of_fans(fans)
+    kernels = Kernels(kernel * light[..., None, None], grid, centroid, covariance, ray_map.rays, arrived * light)
+    return _with_residual(kernels, ray_map.residual)
 
 
 def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
@@ -616,13 +621,14 @@ def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) 
     clearances = [clearance(aperture, torch.stack([torch.zeros_like(hit), hit])) for aperture, hit in pairs]
     first, last, share = lit_part(height[..., :-1], height[..., 1:], clearances)
     energy = (share * like.new_tensor(np.diff(nodes**2))).expand(first.shape)
-    kernel = unfold(grid, energy_of_rings(grid, first, last, energy)) * beam_share(scene)[..., None, None]
+    kernel, light = unfold(grid, energy_of_rings(grid, first, last, energy)), beam_share(scene)
     weights = safe_divide(energy, energy.sum(-1, keepdim=True).expand_as(energy))
     # A ring of radius h has the variance h²/2 per axis; h² is averaged over every segment.
     variance = (weights * (first * first + first * last + last * last)).sum(-1) / 6
     zero = torch.zeros_like(variance)
     moments = torch.stack([zero, zero]), torch.stack([variance, zero, variance])
-    return _with_residual(Kernels(kernel, grid, *moments, ray_map.rays), ray_map.residual)
+    kernels = Kernels(kernel * light[..., None, None], grid, *moments, ray_map.rays, energy.sum(-1) * light)
+    return _with_residual(kernels, ray_map.residual)
 
 
 def _with_residual(kernels: Kernels, residual: Tensor) -> Kernels:

@@ -74,8 +74,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     else:
         kernel, centroid, covariance = _kernels(scene, lens, window, waves, order)
     shifted = Kernels(
-        kernel, grid, lens.chief + centroid, covariance, rays=0, ray_centroid=lens.chief + shift, ray_covariance=blur
-    )
+        kernel, grid, lens.chief + centroid, covariance, rays=0, arrived=torch.ones_like(lens.defocus),
+        ray_centroid=lens.chief + shift, ray_covariance=blur,
+    )  # fmt: skip
     return dataclasses.replace(to(shifted, dtype=grid.pitch.dtype), grid=grid) if single else shifted
 
 

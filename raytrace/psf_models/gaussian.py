@@ -427,7 +427,7 @@ def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
     is_mirrored = symmetry(scene) != "none" and bool((distance < 1e-12).all())
     pixels = gaussian_pixels(grid, centroid, covariance[::2] if is_mirrored else covariance)
     energy = arrives.sum(-1) * beam_share(scene)
-    return Kernels(energy[..., None, None] * pixels, grid, centroid, covariance, points.shape[1])
+    return Kernels(energy[..., None, None] * pixels, grid, centroid, covariance, points.shape[1], energy)
 
 
 def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kernels]:
@@ -438,7 +438,7 @@ def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kerne
     centroid, covariance = moments_of_rays(light.hits, arrives, fold)
     energy = arrives.sum(-1) * beam_share(scene)
     shape = gaussian_pixels(grid, centroid, covariance if fold == "none" else covariance[::2])
-    return light, shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays)
+    return light, shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays, energy)
 
 
 def trace_light(scene: Scene, order: int, fold: str) -> Light:

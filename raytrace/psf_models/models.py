@@ -664,7 +664,6 @@ def plain_rays_shared(plain: Callable[..., Kernels], share: Share, scene: Scene,
         return points[:, share.part(count)], weights[share.part(count)]
 
     light = plain(scene, grid, rays=rays, sampling=some)
-    assert light.arrived is not None  # as of independent rays
     arrived, centroid, covariance = (
         gathered(t).movedim(0, -1) for t in (light.arrived, light.centroid, light.covariance)
     )

@@ -32,7 +32,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0
     centroid = chief_ray_height(scene)
     kernel = gaussian_pixels(grid, centroid, torch.stack([variance, variance]))
     covariance = torch.stack([variance, torch.zeros_like(variance), variance])
-    return Kernels(kernel, grid, centroid, covariance, rays=0)
+    return Kernels(kernel, grid, centroid, covariance, rays=0, arrived=torch.ones_like(variance))
 
 
 def need_one_focus(lens: Lens, what: str, instead: str) -> None:

@@ -93,8 +93,8 @@ class Kernels:
         integrated over pixels; of waves, of the light inside the window: behind a hard edge the second moment diverges.
     ray_centroid, ray_covariance: of waves, the same of their rays, whatever the window; else None.
     rays: number of rays traced for each kernel; 0 if none.
+    arrived: (D, F, W) energy on the whole sensor plane.
     residual: (D, F, W) error of the model itself (relative L1), or None where it has no estimate.
-    arrived: (D, F, W) of independent rays, the energy on the whole sensor plane, or None.
     """
 
     kernel: Tensor
@@ -102,10 +102,10 @@ class Kernels:
     centroid: Tensor
     covariance: Tensor
     rays: int
+    arrived: Tensor
     residual: Tensor | None = None
     ray_centroid: Tensor | None = None
     ray_covariance: Tensor | None = None
-    arrived: Tensor | None = None
 
     @property
     def energy(self) -> Tensor:
@@ -137,9 +137,9 @@ class Psf(Result):
     distribution before pixel integration: of all its light; of waves of the light inside the window, because behind a
     hard edge the second moment grows with the window without limit. nan with gradient 0 where no ray reaches the
     sensor. ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of the rays of waves, or of
-    their geometric limit, else again centroid and covariance. residual: (D, F) error of the model itself, or None where
-    it has no estimate. arrived: (D, F) of independent rays, the energy on the whole sensor plane, which `energy` lacks
-    where it lies outside the window; the rest of 1 is vignetted or fails in the lens; else None. model: its name;
+    their geometric limit, else again centroid and covariance. arrived: (D, F) energy on the whole sensor plane; the
+    rest of 1 is vignetted or fails in the lens. residual: (D, F) error of the model itself, or None where it has no
+    estimate. model: its name;
     waves: whether its light is diffracted; order: as for `DRT(order=…)`, None for independent rays; rays: traced for
     each kernel; reason: why `auto` chose the model, or a remark on convergence. normalised: "energy" (1 = all light
     through the entrance pupil) or "window" (each kernel sums to 1). wavelengths, wavelength_weights: (W,) µm and shares
@@ -156,13 +156,13 @@ class Psf(Result):
     covariance: Tensor
     ray_centroid: Tensor
     ray_covariance: Tensor
+    arrived: Tensor
     lens: Lens
     fields: Tensor
     object_distances: Tensor
     wavelengths: Tensor
     wavelength_weights: Tensor
     residual: Tensor | None = None
-    arrived: Tensor | None = None
     model: str = ""
     waves: bool = False
     order: int | None = None
@@ -171,6 +171,11 @@ class Psf(Result):
     normalised: str = "energy"
     parameters: Parameters | None = None
     framed: bool = True
+
+    @property
+    def energy_outside(self) -> Tensor:
+        """(D, F): share of the light on the sensor plane that is outside the window, 0 where no light arrives."""
+        return (safe_divide(self.arrived - self.energy, self.arrived)).clamp_min(0.0)
 
     @property
     def wavelengths_summed(self) -> bool:
@@ -345,7 +350,8 @@ def polychromatic(kernels: Kernels, scene: Scene, weights: Tensor | None, model:
     share = share / share.sum()
     if weights is not None:
         kernel = (share[:, None, None] * kernel).sum(-3)
-        residual, arrived = (None if t is None else (share * t).sum(-1) for t in (residual, arrived))
+        arrived = (share * arrived).sum(-1)
+        residual = None if residual is None else (share * residual).sum(-1)
         rays = mixture(torch.where(kernels.dark, 0.0, share), *rays)
         # The light inside a window counts by its energy there.
         moments = mixture(share * energy, *moments) if waves else rays
@@ -361,13 +367,13 @@ def polychromatic(kernels: Kernels, scene: Scene, weights: Tensor | None, model:
         covariance=moments[1],
         ray_centroid=rays[0],
         ray_covariance=rays[1],
+        arrived=arrived,
         lens=scene.lens,
         fields=scene.fields,
         object_distances=scene.lens.surfaces[0].thickness.flatten(),
         wavelengths=scene.wavelengths,
         wavelength_weights=share,
         residual=residual,
-        arrived=arrived,
         model=model,
         waves=waves,
         rays=kernels.rays,

@@ -72,7 +72,7 @@ def _of_field(scene: Scene, order: int) -> Tensor:
     with torch.no_grad():
         best = torch.stack([_intensity(light, *top) for top in tops.unbind(1)]).argmax(0, keepdim=True)
         x, y = (c.gather(0, best)[0] for c in tops)
-        x, y = _climbed(light, x, y, width, 1)
+        x, y = _climbed(light, x, y, width, 2)
     x, y = _climbed(light, x, y, width, 1)
     peak = light.amplitude.sum(-1) / (1e-3 * probe.wavelength / probe.index)
     return safe_divide(_intensity(light, x, y), peak**2)
@@ -85,12 +85,12 @@ def _intensity(light: Waves, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _climbed(light: Waves, x: Tensor, y: Tensor, width: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Points (D, F, W) mm some Newton steps nearer to a maximum of the intensity, by differences over λ/1000 NA.
+    """Points (D, F, W) mm some Newton steps nearer to a maximum of the intensity, by differences over ε^¼ λ/NA.
 
     The Hessian is a constant: at a maximum a step is 0 and its derivatives are those of the maximum. Along directions
     in which the intensity has no maximum there is no step.
     """
-    h, longest = 1e-3 * width, width / _FINE
+    h, longest = torch.finfo(width.dtype).eps ** 0.25 * width, width / _FINE
     offsets = h[..., None] * h.new_tensor([-1.0, 0.0, 1.0])
     for _ in range(steps):
         U = amplitude(light, x[..., None] + offsets, y[..., None] + offsets)

@@ -63,8 +63,8 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
         light = waves(part, points.corner, order=order, probe=probe)
         kernel, centroid, covariance = points.integrated(light, probe)
         residual = _debye_residual(light.wavefront, probe, points.corner)
-        rays = light.amplitude.shape[-1]
-        return Kernels(kernel, window, centroid, covariance, rays, residual, *_moments(light))
+        rays, arrived = light.amplitude.shape[-1], light.wavefront.energy.sum(-1)
+        return Kernels(kernel, window, centroid, covariance, rays, arrived, residual, *_moments(light))
 
     return by_field(scene, grid, of_field)
 

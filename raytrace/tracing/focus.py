@@ -116,8 +116,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene: Un
     """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
 
     Arguments as for `focus_of_rms`, whose result starts the search. Rays are traced once, to the sensor's present
-    position; those that its rim clips there stay clipped. Not differentiable. Raises EmptySpot if the rays have no
-    focus, ValueError as `focus_of_merit`.
+    position; those that its rim clips there stay clipped. Not differentiable: on the axis the least mean is at a kink,
+    where the rays of one ring cross. Raises EmptySpot if the rays have no focus, ValueError as `focus_of_merit`.
     """
     with torch.no_grad():
         start = focus_of_rms(lens, pupil, weights, **scene)
@@ -136,7 +136,7 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene: Un
             total = total + (share * radius).sum()
         return total
 
-    return focus_of_merit(merit, start).detach()
+    return focus_of_merit(merit, start)
 
 
 def mean_rms_radius(
@@ -273,19 +273,18 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
 def focus_of_merit(
     merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10
 ) -> Tensor:
-    """Sensor distance (scalar, mm) that minimises a differentiable merit function of it.
+    """Sensor distance (scalar, mm) that minimises a merit function of it, without derivatives.
 
-    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
-    step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's
-    method (scipy); one Newton step attaches the implicit derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so that the result is
-    differentiable once. Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    merit: sensor distance (scalar, mm) -> scalar, differentiable; start: mm, within the basin of the minimum; step: mm,
+    the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's method
+    (scipy). Raises ValueError if the merit has no minimum within 2²⁰ steps.
     """
 
-    def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
-        s = s if s.requires_grad else s.detach().requires_grad_()
-        return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
+    def slope_at(s: float) -> float:
+        sensor = start.new_tensor(s).requires_grad_()
+        return float(torch.autograd.grad(merit(sensor), sensor)[0])
 
-    first, slope_at = float(start), lambda s: float(slope(start.new_tensor(s)))
+    first = float(start)
     here = slope_at(first)
     if here != 0:
         direction = -step if here > 0 else step
@@ -297,11 +296,4 @@ def focus_of_merit(
             raise ValueError(f"the merit has no minimum within {abs(last - first):g} mm of sensor distance {first:g}")
         low, high = sorted((first, last))
         first = scipy.optimize.brentq(slope_at, low, high, xtol=tolerance, rtol=8.9e-16)
-    s = start.new_tensor(first).requires_grad_()
-    gradient = slope(s, create_graph=True)
-    if not gradient.requires_grad:
-        return s.detach()
-    (bend,) = torch.autograd.grad(gradient, s, retain_graph=True)
-    if float(bend) <= 0:
-        return s.detach()
-    return s.detach() - (gradient - gradient.detach()) / bend.detach()
+    return start.new_tensor(first)

@@ -30,7 +30,7 @@ _FEWEST = 256  # rays of a chunk: with fewer, overhead dominates
 _PILOT = 2**16  # first rays: largest distances are measured from their centroid
 _SOBOL_BITS = torch.quasirandom.SobolEngine.MAXBIT
 _SOBOL_POINTS = 2**_SOBOL_BITS
-#: Bytes of temporaries a ray takes at most, in float64 by the eager trace; measured, see docs/streaming.md.
+#: Bytes of temporaries a ray takes at most, in float64 by the eager trace; measured, see docs/reference/streaming.md.
 _BYTES_OF_TRACE, _BYTES_OF_SEARCH, _BYTES_OF_AIMED_SURFACE, _BYTES_OF_RECORDED_SURFACE = 768, 5632, 768, 512
 
 Progress = Callable[[int], object]

@@ -130,7 +130,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
     if browser:
         webbrowser.open(address)
     warnings.simplefilter("ignore")  # the page lists them as remarks, and sessions share the filters
-    torch.set_num_threads(1)  # of small batches of rays more threads wait for each other: measured in docs/viewer.md
+    torch.set_num_threads(1)  # with more threads small batches wait: measured in docs/reference/viewer.md
     settings = uvicorn.Config(app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(settings).run(sockets=[listener])

@@ -238,6 +238,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
                 "smaller window, or the wave camera, which takes any height but no lens"
             )
         light = waves(part, reach, order=order, probe=probe)
+        arrived = light.wavefront.energy.sum(-1)
         stop = _at_stop(part, light.wavefront.pupil)
         if light.symmetry != "none" and not radial:
             light, stop = _unfolded(light, stop, arms)
@@ -249,7 +250,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
             opd = front.opd + torch.stack(added, 2)
             light = dataclasses.replace(light, wavefront=dataclasses.replace(front, opd=opd))
         kernel, centroid, covariance = points.integrated(light, probe)
-        return Kernels(kernel, window, centroid, covariance, light.amplitude.shape[-1])
+        return Kernels(kernel, window, centroid, covariance, light.amplitude.shape[-1], arrived)
 
     return by_field(scene, grid, of_field)
 
