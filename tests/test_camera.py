@@ -56,6 +56,7 @@ from raytrace.wave_optics.element import phase_element
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
 SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
 MICROMETRE = 1e-3
+COLOUR = Sensor(size=(24, 16), pixels=(240, 160), response="rgb", mosaic="RGGB", full_well=1e3, read_noise=2, bits=8)
 NOISY = Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1, saturation=math.inf)
 
 
@@ -544,6 +545,52 @@ def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():
         own(torch.rand(1, 1, 32, 32), 25.0)
     with pytest.raises(ValueError, match="beyond the edges of the sensor of 24 x 16 mm"):
         own(torch.rand(1, 1, 32, 32), 25e3, points=torch.tensor([[12.1], [0.0]]))
+
+
+def test_places_given_in_another_order_are_refused():
+    variables = Variables(read_lens("cooke_triplet").at(wavelengths=[0.55]))
+    own = Camera(variables, Same(), sensor=Sensor((24, 16), (240, 160)), pixels=7, model=Gaussian(order=3))
+    pictures, points = torch.rand(2, 1, 16, 16), torch.tensor([[0.0, 1.0], [10.0, 7.0]])
+    with pytest.raises(ValueError, match=r"\(0, 10\) mm is beyond .*; expected points \(2, B\), all x"):
+        own(pictures, 2e4, points=points)
+    assert own(pictures, 2e4, points=points.T).shape == (2, 1, 10, 10)
+    with pytest.raises(ValueError, match=r"points of shape \(3, 2\): expected \(2, 3\) mm, .* points.T"):
+        own.kernels([2e4] * 3, points=torch.zeros(3, 2))
+    with pytest.raises(TypeError, match="points: a list"):
+        own(pictures, 2e4, points=[[0, 0], [0, 0]])
+    with pytest.raises(ValueError, match=r"fields of shape \(3, 2\)"):
+        Camera(own.variables, Same(), fields=torch.zeros(3, 2))
+    with pytest.raises(ValueError, match="field 3: expected the number of a field, 0 to 2"):
+        own(pictures, 2e4, field=3)
+
+
+def test_one_distance_is_that_of_all_places():
+    variables = Variables(read_lens("cooke_triplet").at(wavelengths=[0.55]))
+    own = Camera(variables, Same(), sensor=Sensor((24, 16), (240, 160)), pixels=7, model=Gaussian(order=3))
+    pictures, points = torch.rand(2, 1, 16, 16), torch.tensor([[0.0, 1.0], [0.0, 7.0]])
+    for places in ({"points": points}, {"field": [0, 2]}):
+        assert torch.equal(own(pictures, 2e4, **places), own(pictures, [2e4] * 2, **places))
+
+
+@pytest.mark.parametrize("model", [Gaussian(order=3), DRT(order=1)])
+def test_pictures_on_the_processor_stay_there_under_another_default_device(model):
+    lens = read_lens("cooke_triplet").at(wavelengths=[0.48, 0.55, 0.65])
+    own, other = (Camera(Variables(lens, "sensor"), Same(), sensor=COLOUR, pixels=7, model=model) for _ in range(2))
+    levels = torch.randint(0, 255, (2, 3, 16, 16), dtype=torch.uint8)
+    points, index = torch.tensor([[0.0, 1.0], [0.0, 7.0]]), torch.arange(2)
+
+    def pictures(camera):
+        yield camera(levels, 2e4, points=points, index=[0, 1])
+        yield camera.target(levels)
+        yield camera.sensor.patch_points(camera.sensor.random_patches(index, 10), 10)
+
+    expected = [*pictures(other)]
+    with torch.device("meta"):
+        again = [*pictures(own)]
+        again[0].sum().backward()
+        own.variables.project()
+        assert own(levels[:1], 2e4).device.type == "cpu"  # of noise without numbers
+    assert all(map(torch.equal, again, expected))
 
 
 @pytest.mark.parametrize(("model", "field"), [(Paraxial(), 0), (Gaussian(order=4), 11), (DRT(order=2), 11)])

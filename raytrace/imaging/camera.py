@@ -46,6 +46,7 @@ from collections.abc import Callable, Sequence
 from importlib import metadata
 from typing import Any, Generic, Literal, Self, TypeVar, get_args
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -72,6 +73,7 @@ from raytrace.imaging.render import Rendering, element_in_stop, illumination_at,
 from raytrace.imaging.restoration import restore
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
+from raytrace.maths.numerics import as_tensor
 from raytrace.maths.result import plain
 from raytrace.psf_models import MODELS, NotConverged, model_of, name_of
 from raytrace.system.identity import alike
@@ -135,6 +137,7 @@ class Camera(nn.Module, Generic[V]):
     element: PhaseVariables | None
     network: nn.Module
     filter: LinearFilter | None
+    _order: int | None
     _sampling: Plan | None
     psf_parameters: Model | None
 
@@ -332,8 +335,9 @@ class Camera(nn.Module, Generic[V]):
             self._order = stored.get("order", self._order)
         if sampling := stored.get("sampling"):
             self._sampling = Plan(**{**sampling, "band": tuple(sampling["band"])})
-        memory = stored.get("lens_steps")
-        self._steps = None if memory is None else LensSteps(self.variables, memory)
+        self._steps = None
+        if isinstance(self.variables, Variables) and (memory := stored.get("lens_steps")) is not None:
+            self._steps = LensSteps(self.variables, memory)
 
     def _load_from_state_dict(
         self, state_dict: dict, prefix: str, local_metadata: dict, strict: bool, missing: list[str], *lists: list[str]
@@ -416,12 +420,12 @@ class Camera(nn.Module, Generic[V]):
     ) -> Tensor:
         """PSFs (B, C, rows, columns) of object distances (B,) mm, of the channels of the sensor.
 
-        object_distances: a tensor, a sequence or one number. field: number of one of the camera's `fields`, or (B,)
-        numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one lens or (B, N);
-        the object points are those that the nominal lens images at these places. PSFs are 0 where no light arrives,
-        with the warning DarkPlaces. Of PSFs of sum 1, EnergyOutside warns once, where more than 10 % of the light is
-        outside the window. draw: of an element alone, generator of errors of fabrication. Raises ValueError for points
-        that are not finite.
+        object_distances: a tensor, a sequence, or one number for all places. field: number of one of the camera's
+        `fields`, or (B,) numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one
+        lens or (B, N); the object points are those that the nominal lens images at these places. PSFs are 0 where no
+        light arrives, with the warning DarkPlaces. Of PSFs of sum 1, EnergyOutside warns once, where more than 10 % of
+        the light is outside the window. draw: of an element alone, generator of errors of fabrication. Raises
+        ValueError for places beyond the sensor and other shapes.
         """
         is_of_sum_1 = self.normalise == "window"
         kernels, lens, points = self._kernels(
@@ -479,6 +483,8 @@ class Camera(nn.Module, Generic[V]):
     ) -> tuple[Tensor, Lens, Tensor | None]:
         """PSFs as of `kernels`, of other sums, without illumination; the lens; points of the sensor, if known."""
         distances, nominal = self._distances(object_distances), self.lens()
+        if len(distances) == 1:  # of all places
+            distances = distances.expand(points.shape[-1] if isinstance(points, Tensor) else np.size(field))
         lens, count = nominal, len(distances)
         if points is None and self.points is not None:
             points = self._of_field(self.points, field, count)
@@ -526,7 +532,11 @@ class Camera(nn.Module, Generic[V]):
     @staticmethod
     def _of_field(places: Tensor, field: int | Sequence[int], count: int) -> Tensor:
         """Places (2, B), of the camera's (2, F), at one number of a field, or at one for each of B images."""
-        return places[:, torch.as_tensor(field, device=places.device).expand(count)]
+        numbers, most = as_tensor(field), places.shape[1]
+        if numbers.numel() not in (1, count) or not bool(((-most <= numbers) & (numbers < most)).all()):
+            expected = f"the number of a field, 0 to {most - 1}, or one for each of {count} images"
+            raise ValueError(f"field {numbers.tolist()}: expected {expected}")
+        return places[:, numbers.to(places.device).expand(count)]
 
     def kernels_over_field(
         self,
@@ -537,6 +547,8 @@ class Camera(nn.Module, Generic[V]):
     ) -> Tensor:
         """PSFs (Z, N, C, rows, columns) of object distances (Z,) mm at the camera's fields, or at points (2, N) mm."""
         distances = self._distances(object_distances)
+        if points is not None:
+            check_points(points, np.shape(points)[-1])
         count = self.fields.shape[1] if points is None else points.shape[1]
         each, places = distances.repeat_interleave(count), [*range(count)] * len(distances)
         if points is None:
@@ -553,8 +565,11 @@ class Camera(nn.Module, Generic[V]):
         if bool(beyond.any()):
             x, y = points.detach()[:, beyond][:, 0].tolist()
             width, height = self.sensor.size
+            transposed = points.T if tuple(points.shape) == (2, 2) else points.flip(0)
+            is_swapped = bool(((transposed.detach() - middle).abs() <= (1 + 1e-6) * half).all())
+            advice = "; expected points (2, B), all x and then all y" if is_swapped else ""
             raise ValueError(
-                f"a point at ({x:g}, {y:g}) mm is beyond the edges of the sensor of {width:g} x {height:g} mm"
+                f"a point at ({x:g}, {y:g}) mm is beyond the edges of the sensor of {width:g} x {height:g} mm{advice}"
             )
 
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
@@ -614,7 +629,7 @@ class Camera(nn.Module, Generic[V]):
             or (light.shape[0] != count and 1 not in (len(light), count))
         ):
             raise ValueError(
-                f"pictures of shape {tuple(torch.as_tensor(picture).shape)} at {count} object distances: expected "
+                f"pictures of shape {tuple(np.shape(picture))} at {count} object distances: expected "
                 f"({count}, {len(channels)}, H, W), one for each, of the channels {', '.join(channels)} of the sensor"
             )
         if (most := float(light.detach().max())) > _LARGEST:
@@ -689,7 +704,7 @@ class Camera(nn.Module, Generic[V]):
         `Sensor.capture`, by default random numbers of torch's generator.
         """
         if index is None:
-            index = torch.randint(2**62, (len(image),))
+            index = torch.randint(2**62, (len(image),), device="cpu")
         centre = self.sensor.corners.mean(1, keepdim=True) if points is None else points.detach()
         size = image.new_tensor([image.shape[-1], image.shape[-2]], dtype=torch.float64)
         first = self.sensor.pixel_of(centre.to(size)).T - 0.5 * (size - 1)

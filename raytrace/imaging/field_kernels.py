@@ -53,7 +53,7 @@ from raytrace.wave_optics.element import Element, is_radial
 from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, named_value
 
 #: Kernels have the sum 1 ("window"), or the share of all light: the rest is lost ("energy"), or an even haze ("haze").
 Normalisation: TypeAlias = Literal["window", "energy", "haze"]
@@ -504,9 +504,14 @@ def _normalised(light: Tensor, arrived: Tensor, normalise: KernelSum) -> Tensor:
 
 
 def check_points(points: Tensor, count: int) -> None:
-    """Raise ValueError for places (2, count) mm of another shape, or that are not finite."""
+    """Raise ValueError for places (2, count) mm of another shape, or that are not finite, TypeError for others."""
+    if not isinstance(points, Tensor):
+        raise TypeError(f"points: {named_value(points)}; expected a tensor (2, {count}) mm, x and y on the sensor")
     if tuple(points.shape) != (2, count):
-        raise ValueError(f"points of shape {tuple(points.shape)}: expected (2, {count}) mm, a place for each image")
+        advice = ", as points.T" if tuple(points.shape) == (count, 2) else ""
+        raise ValueError(
+            f"points of shape {tuple(points.shape)}: expected (2, {count}) mm, a place for each image{advice}"
+        )
     if not bool(torch.isfinite(points.detach()).all()):
         beyond = int((~torch.isfinite(points.detach())).any(0).sum())
         raise ValueError(f"{beyond} of {count} points are nan or infinite: expected places of the sensor in mm")

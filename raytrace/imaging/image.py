@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import broadcast_shape, safe_divide, safe_sqrt
+from raytrace.maths.numerics import as_tensor, broadcast_shape, safe_divide, safe_sqrt
 
 #: Extension beyond the borders of an image: "zero"; "reflect", its mirror image; "taper", a blend of the mirror images
 #: at opposite borders, so that the periodic continuation has no jump.
@@ -32,7 +32,7 @@ def as_picture(picture: Tensor | np.ndarray, what: str = "picture") -> Tensor:
 
     Raises ValueError for other integers, whose white level is unknown, and for complex numbers.
     """
-    picture = torch.as_tensor(picture)
+    picture = as_tensor(picture)
     if picture.is_floating_point():
         return picture
     if picture.dtype not in _WHITE:
@@ -45,7 +45,7 @@ def as_picture(picture: Tensor | np.ndarray, what: str = "picture") -> Tensor:
 
 def linearised(picture: Tensor | np.ndarray) -> Tensor:
     """Numbers as they are; integers of 8 or 16 bits as the light that sRGB encodes (IEC 61966-2-1)."""
-    picture = torch.as_tensor(picture)
+    picture = as_tensor(picture)
     if picture.is_floating_point():
         return picture
     return decoded(as_picture(picture))
@@ -219,7 +219,7 @@ def blur_layers(
 
 def occlusion(layers: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
     """The image (..., C, H, W) of layers from far to near, each its light and its coverage; the first one is opaque."""
-    total = torch.zeros(())
+    total = torch.zeros((), device="cpu")
     for light, cover in layers:
         total = (1 - cover) * total + light
     return total

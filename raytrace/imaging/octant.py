@@ -84,8 +84,8 @@ def octant_error(kernels: ElementKernels, spectrum: Tensor, sigma: Tensor) -> Te
 
 def _between(places: Tensor, count: int) -> Tensor:
     """(P, K) from values of an even function at K Chebyshev points of [0, 1] to those at places (P,)."""
-    points = torch.cos((2 * torch.arange(count, dtype=places.dtype) + 1) * (math.pi / (4 * count)))
-    order = 2 * torch.arange(count, dtype=places.dtype)
+    order = 2 * torch.arange(count, dtype=places.dtype, device=places.device)
+    points = torch.cos((order + 1) * (math.pi / (4 * count)))
     series = torch.where(order == 0, 1.0, 2.0)[:, None] / count * torch.cos(order[:, None] * torch.arccos(points))
     return torch.cos(order * torch.arccos(places)[:, None]) @ series
 
@@ -93,7 +93,7 @@ def _between(places: Tensor, count: int) -> Tensor:
 @functools.lru_cache(maxsize=4)
 def _to_octant(rows: int, pitch: float, cutoff: float, order: int, size: int) -> Tensor:
     """Q (F, K)."""
-    window = grid(torch.tensor(pitch, dtype=torch.float64), rows)
+    window = grid(torch.tensor(pitch, dtype=torch.float64, device="cpu"), rows)
     _, to_pixels = radii_of_waves(window, cutoff, order)
     a, b = _octant(size)
     parts = [transfer_functions(unfold(window, part), size).real[..., a, b] for part in to_pixels.T.split(_CHUNK)]

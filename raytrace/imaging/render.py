@@ -50,7 +50,7 @@ from raytrace.imaging.varying_blur import bilinear, varying_blur
 from raytrace.imaging.warp import resampled
 from raytrace.io.pictures import write_light, write_picture
 from raytrace.materials.glass import OutOfRange
-from raytrace.maths.numerics import placed, varies
+from raytrace.maths.numerics import as_tensor, placed, varies
 from raytrace.maths.result import Result, plain
 from raytrace.plotting.style import FIELD_COLOURS, Figure, array, new_figure, styled
 from raytrace.psf_models import MODELS, NotConverged, model_name
@@ -295,13 +295,13 @@ def optics(
     check_model(model, elements)
     like = lens.surfaces[-2].thickness
     lens = lens if object_distances is None else by_angle(lens)
-    distances = lens.surfaces[0].thickness if object_distances is None else torch.as_tensor(object_distances)
+    distances = lens.surfaces[0].thickness if object_distances is None else as_tensor(object_distances)
     distances = distances.to(like).reshape(-1)
     planes, nearer = (1 / distances).sort()
     distances = distances[nearer]
     of_fields = lens
     if wavelengths is not None:
-        lens = _at_specified(lens, torch.as_tensor(wavelengths).to(like))
+        lens = _at_specified(lens, as_tensor(wavelengths).to(like))
     sampled = lens
     response = sensor.response if wavelengths is None and len(lens.wavelengths) > 1 else None
     if not is_stop_alone(lens):
@@ -659,7 +659,8 @@ def _grid(
             middles = _places(sensor, m, n, like, 0.5)
             # Cells evenly spaced in the order of their distance from the middle of the sensor.
             outwards = torch.hypot(*(middles - middles.mean(1, keepdim=True))).argsort(stable=True)
-            cells = outwards[torch.linspace(0, len(outwards) - 1, min(_CELLS, len(outwards))).round().long()]
+            some = torch.linspace(0, len(outwards) - 1, min(_CELLS, len(outwards)), device=like.device)
+            cells = outwards[some.round().long()]
             mean = (0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])).flatten(0, 1)[cells]
             error = float((mean - kernels_at(middles[:, cells])).abs().sum((-2, -1)).amax((1, 2)).mean())
             if error <= tol or count >= _MOST_NODES:
@@ -976,7 +977,7 @@ def plane_distances(depth: Tensor, planes: int) -> Tensor:
         raise ValueError("a depth map without distances above 0, or no planes: expected distances in mm from surface 1")
     levels = known.unique()
     ends = float(levels[0]), float(levels[-1])
-    return levels if len(levels) <= planes else torch.linspace(*ends, planes, dtype=depth.dtype)
+    return levels if len(levels) <= planes else torch.linspace(*ends, planes, dtype=depth.dtype, device=depth.device)
 
 
 def default_sensor(

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import EXTENSIONS, as_picture, check_axes, check_fit, extend
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import as_tensor, safe_divide, safe_sqrt
 
 
 def wiener(transfer: Tensor, noise_to_signal: Tensor | float) -> Tensor:
@@ -403,7 +403,7 @@ def psnr(mean_square: Tensor, *, peak: float = 1.0) -> Tensor:
 
     Raises ValueError for errors of integer images, whose differences wrap around.
     """
-    mean_square = torch.as_tensor(mean_square)
+    mean_square = as_tensor(mean_square)
     if not mean_square.is_floating_point():
         kind = str(mean_square.dtype).removeprefix("torch.")
         raise ValueError(

@@ -22,7 +22,7 @@ from raytrace.imaging.image import add_noise, add_shot_noise, as_picture, count_
 from raytrace.imaging.pictures import draws
 from raytrace.imaging.spectral_response import SpectralResponse, channel_names, channel_weights, read_response
 from raytrace.io import as_lens
-from raytrace.maths.numerics import differentiating, varies
+from raytrace.maths.numerics import as_tensor, differentiating, varies
 from raytrace.system.lens import Lens, aligned, wavelengths_of, with_field_kind
 from raytrace.tracing.launch import field_of_object, object_field, rays_of_field
 from raytrace.tracing.paraxial import axial_beam
@@ -347,10 +347,10 @@ class Sensor:
         size: (rows, columns) of the patches, or one number. Raises ValueError for patches larger than the sensor.
         """
         height, width = self._patch(size)
-        (columns, rows), index = self.pixels, torch.as_tensor(index).reshape(-1)
+        (columns, rows), index = self.pixels, as_tensor(index).reshape(-1)
         random = (draws(_whole(seed, "seed"), number, _PATCH) for number in _indices(index.shape, index))
         origins = [[r.integers(columns - width + 1), r.integers(rows - height + 1)] for r in random]
-        return torch.tensor(np.array(origins, np.int64).reshape(-1, 2))
+        return torch.from_numpy(np.array(origins, np.int64).reshape(-1, 2))
 
     def patch_points(self, origins: Tensor, size: int | tuple[int, int]) -> Tensor:
         """Centre points (2, ...) mm of patches with origins (..., 2) and a size as for `random_patches`."""
@@ -382,7 +382,7 @@ def _pair(numbers: Any, name: str, kind: type, expected: str) -> tuple:
 
 def _numbers(numbers: object) -> Tensor:
     """Floating-point numbers; plain and whole ones are of float64."""
-    numbers = torch.as_tensor(numbers) if isinstance(numbers, Tensor) else torch.as_tensor(numbers, dtype=torch.float64)
+    numbers = as_tensor(numbers, dtype=torch.float64)
     return numbers if numbers.is_floating_point() else numbers.to(torch.float64)
 
 
@@ -404,7 +404,7 @@ def _indices(batch: Sequence[int], index: Tensor | Sequence[int] | None) -> list
     """The numbers of the pictures of a batch, in order."""
     if index is None:
         return [*range(math.prod(batch))]
-    index = torch.as_tensor(index)
+    index = as_tensor(index)
     if index.is_floating_point() or tuple(index.shape) != tuple(batch) or bool((index < 0).any()):
         shown = f"{tuple(index.shape)}, {str(index.dtype).removeprefix('torch.')}"
         raise ValueError(f"index of shape {shown}: expected whole numbers {tuple(batch)} from 0 up, one per picture")

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import as_picture, linearised
+from raytrace.maths.numerics import as_tensor
 from raytrace.maths.result import Column, Result, Table
 from raytrace.plotting.style import GREY, Figure, array, field_colour, new_figure, styled
 
@@ -54,7 +55,7 @@ class SlantedEdgeMtf(Result):
     def at(self, frequencies: Tensor) -> Tensor:
         """MTF (...) at frequencies (...) cycles/mm, linear between those measured."""
         step = self.frequencies[1]
-        place = (torch.as_tensor(frequencies).to(self.mtf) / step).clamp(0, len(self.mtf) - 1)
+        place = (as_tensor(frequencies).to(self.mtf) / step).clamp(0, len(self.mtf) - 1)
         left = place.floor().clamp_max(len(self.mtf) - 2).long()
         return self.mtf[left] + (place - left) * (self.mtf[left + 1] - self.mtf[left])
 
@@ -97,7 +98,7 @@ def slanted_edge_mtf(picture: Tensor | np.ndarray, pitch: float) -> SlantedEdgeM
     Raises ValueError for pictures without an edge, too small ones, clipped levels of integers, and edges that are
     parallel to the pixels.
     """
-    levels = torch.as_tensor(picture)
+    levels = as_tensor(picture)
     if levels.dim() != 2 or min(levels.shape) < _LEAST_SIDE:
         raise ValueError(
             f"a picture of shape {tuple(levels.shape)}: expected (H, W) of one channel, {_LEAST_SIDE} pixels or more a "

@@ -23,6 +23,7 @@ from raytrace.imaging.restoration import depth_invariant_wiener, errors, power_s
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.spectral_response import SpectralResponse
 from raytrace.imaging.variables import PhaseVariables
+from raytrace.maths.numerics import as_tensor
 from raytrace.maths.result import Result
 from raytrace.optimization.least_squares import NoOptimum
 from raytrace.plotting.style import (
@@ -110,7 +111,7 @@ def periodic(pictures: Pictures, size: int) -> Tensor:
 def mirrored(picture: Tensor | np.ndarray) -> Tensor:
     """A picture (..., h, w) and its mirror images: one period (..., 2h, 2w) without a jump."""
     h, w = picture.shape[-2:]
-    return extend(torch.as_tensor(picture), (2 * h, 2 * w), boundary="reflect")
+    return extend(as_tensor(picture), (2 * h, 2 * w), boundary="reflect")
 
 
 def best_gamma(H: Tensor, S: Tensor, noise: Tensor | float, at_design: Tensor) -> float:

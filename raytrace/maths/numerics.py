@@ -59,6 +59,14 @@ def in_forward_mode() -> bool:
     return getattr(forward_ad, "_current_level", -1) >= 0
 
 
+def as_tensor(numbers: Any, **like: Any) -> Tensor:
+    """A tensor as it is, where `torch.as_tensor` moves one on the processor to a default device; other numbers on it.
+
+    like: dtype of other numbers.
+    """
+    return numbers if isinstance(numbers, Tensor) else torch.as_tensor(numbers, device="cpu", **like)
+
+
 def varies(number: object) -> bool:
     """Whether a derivative by this number may be requested: backward, forward, by tangents
     (`maths.tangents`), or by a transform of torch.func.
@@ -298,7 +306,7 @@ def select(condition: Tensor | bool, a: Number, b: Number) -> Number:
     if not isinstance(condition, Tensor):
         return a if condition else b
     # Of two plain numbers torch.where makes a tensor of 32 bits.
-    return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64))
+    return torch.where(condition, a, b if isinstance(b, Tensor) else torch.tensor(b, dtype=torch.float64, device="cpu"))
 
 
 def root(x: Number) -> Number:

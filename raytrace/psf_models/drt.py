@@ -371,7 +371,7 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor, Tensor]:
     (x, ax, bx), (y, ay, by) = (cells(t, fans.radius, closed=closed) for t in fans.points - reference)
     lines = x.shape[-2] - 1 if fans.is_half else x.shape[-2]
     weights = cell_energy(fans.radius, lines) * clear_share(fans.clearances, fans.radius, closed=closed)
-    weights = torch.as_tensor(weights).expand(x.shape)
+    weights = weights.expand(x.shape)
     if fans.is_half:
         # All but the outer cells count twice.
         weights = torch.cat([0.5 * weights[..., :1, :], weights[..., 1:-1, :], 0.5 * weights[..., -1:, :]], -2)

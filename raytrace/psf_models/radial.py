@@ -79,7 +79,7 @@ def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> 
     first, last: (..., C) mm, signed heights a, b of the ends of a piece; energy: (..., C) of the pieces, spread evenly
     over their heights.
     """
-    table = torch.as_tensor(_ring_table(grid.rows, grid.columns)).to(grid.pitch.detach())
+    table = torch.from_numpy(_ring_table(grid.rows, grid.columns)).to(grid.pitch.detach())
     last_step = len(table) - 1
     a, b = first / grid.pitch, last / grid.pitch
     # A caustic has pieces without width: the share of a ring is taken there, over a thousandth of a pixel.

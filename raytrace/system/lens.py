@@ -573,6 +573,8 @@ def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tens
                 raise ValueError(f"{option('fields', f'{angle:g}')}: {message}")
         return points
     if isinstance(fields, Tensor):
+        if fields.dim() > 2 or (fields.dim() == 2 and len(fields) != 2):
+            raise ValueError(f"fields of shape {tuple(fields.shape)}: expected y (F,), or (2, F), all x and then all y")
         return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
     listed: Iterable[Any] = fields if isinstance(fields, Iterable) else [fields]
     pairs = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in listed]

@@ -487,7 +487,7 @@ def as_fringe(sag_terms: PolynomialSag) -> FringeSag | None:
     numbers = [j for j in range(2, 37) if fringe(j)[0] <= highest]
     matrix, constants = (terms.new_tensor(part) for part in zernike_to_powers(tuple(map(fringe, numbers))))
     heights = torch.linalg.solve(matrix, terms)
-    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers) - 1,), heights)
+    coefficients = terms.new_zeros(max(numbers)).index_put((torch.tensor(numbers, device=terms.device) - 1,), heights)
     zero = torch.zeros_like(radius)
     return FringeSag(torch.cat([-(constants @ heights)[None], coefficients[1:]]), radius, zero, zero)
 

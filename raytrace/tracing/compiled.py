@@ -470,7 +470,7 @@ def task_of(
     table = parts[0]
     if len(parts) == 2:
         places = {k: place for place, k in enumerate((*single, *several))}
-        columns = torch.tensor([places[k] for k in range(len(numbers))])
+        columns = torch.tensor([places[k] for k in range(len(numbers))], device=table.device)
         table = torch.cat([table.expand(len(parts[1]), -1), parts[1]], -1)[:, columns]
     return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
 

@@ -215,7 +215,7 @@ def _of_gap(lens: Lens, k: int, end: int, side: float, medium: str, clear: float
     if math.isnan(rim) or not math.isfinite(gap):
         return []
     for x, y in ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)):
-        r = torch.linspace(0.0, rim, _HEIGHTS, dtype=torch.float64)
+        r = torch.linspace(0.0, rim, _HEIGHTS, dtype=torch.float64, device="cpu")
         left = edge_thickness(gap, side * _sag(front, x * r, y * r), side * _sag(back, x * r, y * r))
         within = left[r <= clear]
         if within.min() < -_LEAST:

@@ -593,7 +593,7 @@ def unfilled(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> st
 
 def _spread(count: int, most: int) -> list[int]:
     """`most` evenly spaced places of a sequence."""
-    return torch.linspace(0, count - 1, most, dtype=torch.float64).long().tolist()
+    return torch.linspace(0, count - 1, most, dtype=torch.float64, device="cpu").long().tolist()
 
 
 def _words(missed: Tensor, place: str) -> str:

@@ -207,8 +207,8 @@ def _constant_front(bundle: Bundle, numbers: tuple[int, ...] | None) -> _Front:
 def _at_nodes(bundle: Bundle, ends: tuple[float, float]) -> Bundle:
     """The bundle at _NODES object distances (Chebyshev points of 1/distance) and, as a check, at as many between."""
     lens, field, wavelength, pupil = bundle
-    angle = math.pi / (2 * _NODES) * torch.cat([torch.arange(_NODES) * 2 + 1, torch.arange(_NODES) * 2 + 2])
-    node = torch.cos(angle.to(torch.float64))
+    odd = torch.arange(1, 2 * _NODES, 2, dtype=torch.float64, device="cpu")
+    node = torch.cos(math.pi / (2 * _NODES) * torch.cat([odd, odd + 1]))
     near, far = 1 / ends[0], 1 / ends[1]
     distance = 1 / (0.5 * (near + far) + 0.5 * (near - far) * node)
     like = lens.surfaces[0].thickness
@@ -234,7 +234,7 @@ def _is_smooth(front: _Front) -> bool:
     valid = front.rays.valid.expand(front.rays.shape)
     if not torch.equal(valid, valid[:1].expand_as(valid)):
         return False
-    between = torch.cos(math.pi / (2 * _NODES) * (2 * torch.arange(_NODES, dtype=torch.float64) + 2))
+    between = torch.cos(math.pi / (2 * _NODES) * (2 * torch.arange(_NODES, dtype=torch.float64, device="cpu") + 2))
     interpolated = _combined(front.rays, _series_weights(between.to(front.rays.position)))
     traced = _part(front.rays, slice(_NODES, None))
     pairs = [(interpolated.position, traced.position), (interpolated.direction, traced.direction)]

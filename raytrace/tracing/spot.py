@@ -237,7 +237,7 @@ def arrivals(
         rows = [parts[k : k + len(lenses)] for k in range(0, len(parts), len(lenses))]
         return _cat([_cat(row, -4) for row in rows], -3)
 
-    reached, none = joined([reached for _, reached, _ in each]), torch.zeros((), dtype=torch.int64).to(fields.device)
+    reached, none = joined([reached for _, reached, _ in each]), fields.new_zeros((), dtype=torch.int64)
     if all(status is None for *_, status in each):
         status = none.expand(reached.shape)
     else:
