@@ -675,3 +675,8 @@ def test_a_state_keeps_an_order_that_is_given_and_the_sampling_of_an_element():
     alone[0].plan()
     alone[1].load_state_dict(alone[0].state_dict())
     assert alone[1]._sampling == alone[0]._sampling
+
+
+def test_a_camera_without_a_network_names_the_photograph():
+    with pytest.raises(TypeError, match=r"`network` is missing: .*rt.render\(lens, picture\)"):
+        Camera(Variables(read_lens(LENS), "sensor"), sensor=Sensor())

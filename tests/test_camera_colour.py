@@ -159,7 +159,7 @@ def test_a_mosaic_is_that_of_the_place(triplet):
     one = made(triplet, sensor=sensor)
     image = torch.rand(4, 3, 6, 6, dtype=torch.float64)
     origins = torch.tensor([[100, 200], [101, 200], [100, 201], [101, 201]])
-    recorded = one.recorded(image, sensor.patch_points(origins, 6))
+    recorded = one.demosaiced(image, sensor.patch_points(origins, 6))
     wanted = sensor.demosaic(sensor.sample(image, origins), origins)
     torch.testing.assert_close(recorded, wanted)
     assert not torch.equal(recorded[0], sensor.demosaic(sensor.sample(image[0])[None], (1, 0))[0])
@@ -316,7 +316,7 @@ def test_what_does_not_fit_is_refused(triplet):
         one.image(picture[:, :1], distances, points=points)
     with pytest.raises(ValueError, match=r"values up to 255: expected 0 to 1"):
         one.image(255 * torch.ones_like(picture), distances, points=points)
-    with pytest.raises(ValueError, match="pixels 10: expected an odd number"):
+    with pytest.raises(ValueError, match="pixels 10: expected an odd integer"):
         made(triplet, pixels=10)
 
 
@@ -333,9 +333,9 @@ def test_a_state_describes_its_camera_and_loads_into_no_other(triplet):
     assert set(described["versions"]) == {"raytrace", "torch"}
     assert set(described["variables"]) == {"sensor", "curvature_1", "curvature_6"}
     made(triplet).load_state_dict(state)
-    with pytest.raises(OtherLens, match=r"full_well 20000\.0, not 30000\.0"):
+    with pytest.raises(OtherLens, match=r"sensor\.full_well = 20000\.0, this one has 30000\.0"):
         made(triplet, sensor=dataclasses.replace(SENSOR, full_well=3e4)).load_state_dict(state)
-    with pytest.raises(OtherLens, match=r"of a camera of window \[11, 11"):
+    with pytest.raises(OtherLens, match=r"of a camera with window = \[11, 11"):
         made(triplet, pixels=13).load_state_dict(state)
     with pytest.raises(OtherLens, match="the state is of"):
         made(rt.read_lens("tessar"), "sensor curvature:1,6").load_state_dict(state)

@@ -215,7 +215,7 @@ def refined(one: Camera, pictures: Pictures, settings: CodesignSettings, folder:
         taken = torch.as_tensor(draws(settings.seed, step, 78).integers(BANK, size=settings.batch))
         samples = batches(step, share)
         image = blur(samples.picture, bank[taken])
-        recorded = one.recorded(image, points[:, taken], samples.index, settings.seed)
+        recorded = one.demosaiced(image, points[:, taken], samples.index, settings.seed)
         difference = one.restore(recorded) - one.target(samples.picture)
         return difference.abs().mean(), {}
 
@@ -240,7 +240,7 @@ def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, setti
         kernels, errors = kernels_of(one, points.expand(2, TESTED), distances), {}
         for number, kernel in enumerate(kernels):
             image = blur(samples.picture, kernel)
-            recorded = one.recorded(image, points.expand(2, count), samples.index + number * count, settings.seed)
+            recorded = one.demosaiced(image, points.expand(2, count), samples.index + number * count, settings.seed)
             found = {"network": one.restore(recorded), "recorded": recorded}
             found["wiener"] = restore(recorded, filter.to(torch.complex64), boundary="taper")
             for name, estimate in found.items():
@@ -339,7 +339,7 @@ def draw_pictures(study: Study):
     axes = figure.subplots(2, 5)
     for row, (place, filter) in enumerate(zip((0.0, 1.0), filters, strict=True)):
         points = one.sensor.on_diagonal([place])
-        recorded = one.recorded(one.image(scene, distance, points=points), points, [row], 0)
+        recorded = one.demosaiced(one.image(scene, distance, points=points), points, [row], 0)
         target, network = one.target(scene), one.restore(recorded)
         wiener = restore(recorded, filter.to(torch.complex64), boundary="taper")
         shown = {"scene": target, "sensor": recorded, "network": network, "Wiener filter": wiener}

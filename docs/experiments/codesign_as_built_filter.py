@@ -68,7 +68,7 @@ def tested(built: Camera, pictures: Pictures, seed: int, sensor: float, filter: 
     samples = make_batch(pictures, settings, list(range(count)), TEST_EPOCH)
     each = None if errors is None else errors.repeat_interleave(_PATCHES, 0)
     image = built.image(samples.picture.double(), samples.distance, 0, each)
-    image = built.recorded(image, index=samples.index, seed=samples.seed)
+    image = built.demosaiced(image, index=samples.index, seed=samples.seed)
     border = SETTINGS.size // 2
     inner = (..., slice(border, -border), slice(border, -border))
     difference = (restore(image, filter) - built.target(samples.picture.double()))[inner].reshape(_LENSES, -1)

@@ -217,7 +217,7 @@ def examples(
     distances = torch.tensor(distances, dtype=camera.fields.dtype)
     picture = patches.picture[chosen].expand(len(distances), -1, -1, -1)
     index = patches.index[[chosen] * len(distances)]
-    image = camera.recorded(camera.image(picture, distances), index=index, seed=patches.seed)
+    image = camera.demosaiced(camera.image(picture, distances), index=index, seed=patches.seed)
     shown = {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}
     return {name: images[:, 0] for name, images in shown.items()}
 

@@ -420,9 +420,9 @@ def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
     """Σ |filtered - picture| of every sample after linear filters (C, rows, columns), (B,)."""
     batch = batch.to(camera.fields.device)
     image = camera.image(batch.picture, batch.distance, batch.field, batch.errors, points=batch.points)
-    recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
+    captured = camera.demosaiced(image, batch.points, batch.index, batch.seed)
     apply = restore_jointly if filters.dim() == 4 else restore
-    restored = apply(recorded, filters.to(torch.complex64), boundary="taper")
+    restored = apply(captured, filters.to(torch.complex64), boundary="taper")
     return (restored - camera.target(batch.picture)).abs().mean(-3).sum((-2, -1))
 
 
