@@ -35,7 +35,7 @@ def picture(lens, scene, psfs, images, restored):
     inside = (slice(None), *2 * (slice(MARGIN, -MARGIN),))
     panels = right.subplots(3, len(psfs))
     for column, psf, image, estimate, angle in zip(panels.T, psfs, images, restored, fields[1].tolist(), strict=True):
-        show(column[0], (psf / psf.amax((-2, -1), keepdim=True)).sqrt(), f"PSF at {angle:g}°")
+        show(column[0], (psf / psf.amax((-2, -1), keepdim=True)).clamp_min(0).sqrt(), f"PSF at {angle:g}°")
         for panel, one, name in ((column[1], image, "image"), (column[2], estimate, "restored")):
             ratio = float(rt.imaging.psnr((one - scene)[inside].square().mean()))
             show(panel, one[inside], f"{name}, {ratio:.1f} dB")
