@@ -6,7 +6,15 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.imaging.codesign import TEST_EPOCH, Batches, absolute_error, batch, camera, errors_as_built, optimise
+from raytrace.imaging.codesign import (
+    TEST_EPOCH,
+    Batches,
+    absolute_error,
+    errors_as_built,
+    initial_camera,
+    make_batch,
+    optimise,
+)
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.settings import GRADES, CodesignSettings
@@ -43,7 +51,7 @@ def mean_square_radius(lens, fields):
 )
 def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, center):
     settings = dataclasses.replace(BUILT, model=model, refocus="none", fields=(0.0, 7.0), center=center)
-    built = camera(lens, settings)
+    built = initial_camera(lens, settings)
     built._order = 2
     errors, distances = rt.tolerancing.draw_errors(built.tolerances, 2, seed=5), DISTANCES[:2]
     parameters = rt.psf_models.Gaussian(order=2) if model == "gaussian" else rt.psf_models.DRT(order=2)
@@ -68,8 +76,8 @@ def test_a_perturbed_camera_has_the_psf_of_the_perturbed_lens(lens, model, cente
 
 
 def test_without_errors_the_camera_as_built_is_the_nominal_one(lens):
-    built = camera(lens, dataclasses.replace(BUILT, center="chief", fields=(0.0, 7.0)))
-    nominal = camera(lens, dataclasses.replace(SMALL, vary=BUILT.vary, fields=(0.0, 7.0)))
+    built = initial_camera(lens, dataclasses.replace(BUILT, center="chief", fields=(0.0, 7.0)))
+    nominal = initial_camera(lens, dataclasses.replace(SMALL, vary=BUILT.vary, fields=(0.0, 7.0)))
     nominal._order = built._order = 3
     none = torch.zeros(len(built.tolerances), dtype=torch.float64)
     with torch.no_grad():
@@ -83,7 +91,7 @@ def test_without_errors_the_camera_as_built_is_the_nominal_one(lens):
 def test_the_sensor_follows_the_best_focus(lens):
     """The sensor stays as far from the least spot of the perturbed lens as it is from that of the nominal one."""
     settings = dataclasses.replace(BUILT, start="rms", fields=(0.0, 7.0))
-    built = camera(lens, settings)
+    built = initial_camera(lens, settings)
     with torch.no_grad():
         errors = rt.tolerancing.draw_errors(built.tolerances, 2, seed=3)
         nominal = built.variables()
@@ -105,7 +113,7 @@ def test_the_sensor_follows_the_best_focus(lens):
 
 @pytest.mark.slow
 def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
-    built = camera(lens, BUILT)
+    built = initial_camera(lens, BUILT)
     errors = rt.tolerancing.draw_errors(built.tolerances, 4)
     with torch.no_grad():
         still = sensors(
@@ -117,13 +125,13 @@ def test_the_sensor_stays_where_nothing_is_adjusted_and_within_its_limits(lens):
             limited = Compensator(11, minimum=-limit, maximum=limit)
             built.tolerances = dataclasses.replace(built.tolerances, compensators=(limited,))
             assert torch.allclose(sensors(built.as_built(errors)) - still, free.clamp(-limit, limit), atol=1e-12)
-        fixed = camera(lens, dataclasses.replace(BUILT, refocus="none"))
+        fixed = initial_camera(lens, dataclasses.replace(BUILT, refocus="none"))
         assert torch.equal(sensors(fixed.as_built(errors)), still)
 
 
 @pytest.mark.parametrize("refocus", ["sensor", pytest.param("none", marks=pytest.mark.slow)])
 def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, refocus):
-    built = camera(lens, dataclasses.replace(BUILT, refocus=refocus, size=21, fields=(7.0,)))
+    built = initial_camera(lens, dataclasses.replace(BUILT, refocus=refocus, size=21, fields=(7.0,)))
     built._order = 2
     errors = rt.tolerancing.draw_errors(built.tolerances, 3, seed=2)
     weights = torch.linspace(0, 1, 21, dtype=torch.float64)
@@ -144,29 +152,29 @@ def test_gradients_through_the_perturbed_lens_are_those_of_differences(lens, ref
 
 
 def test_errors_are_drawn_by_the_number_of_the_sample(lens, pictures):
-    built = camera(lens, BUILT)
-    every = [batch(pictures, BUILT, list(range(12)), epoch, built.tolerances).errors for epoch in range(2)]
+    built = initial_camera(lens, BUILT)
+    every = [make_batch(pictures, BUILT, list(range(12)), epoch, built.tolerances).errors for epoch in range(2)]
     trials = rt.tolerancing.draw_errors(built.tolerances, 24, BUILT.seed)
     assert torch.equal(torch.cat(every), trials)
-    some = batch(pictures, BUILT, [7, 3], 1, built.tolerances)
+    some = make_batch(pictures, BUILT, [7, 3], 1, built.tolerances)
     assert torch.equal(some.errors, trials[[19, 15]])
     batches = Batches(pictures, BUILT, built.tolerances)
     whole = batches(1, Share()).errors
     halves = [batches(1, Share(rank, 2)).errors for rank in range(2)]
     assert torch.equal(torch.stack(halves, 1).flatten(0, 1), whole)
     assert torch.equal(whole, trials[4:8])
-    other = batch(pictures, dataclasses.replace(BUILT, seed=1), [0], 0, built.tolerances)
+    other = make_batch(pictures, dataclasses.replace(BUILT, seed=1), [0], 0, built.tolerances)
     assert not torch.equal(other.errors[0], trials[0])
-    assert batch(pictures, SMALL, [0], 0).errors is None
+    assert make_batch(pictures, SMALL, [0], 0).errors is None
 
 
 @pytest.mark.slow
 def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
     settings = dataclasses.replace(BUILT, fields=(0.0, 7.0))
-    built = camera(lens, settings)
+    built = initial_camera(lens, settings)
     built._order = 2
     with torch.no_grad():
-        samples = batch(pictures, settings, list(range(4)), 0, built.tolerances)
+        samples = make_batch(pictures, settings, list(range(4)), 0, built.tolerances)
         together = absolute_error(built, samples)
         each = torch.cat(
             [
@@ -190,7 +198,7 @@ def test_a_loss_is_the_sum_over_the_lenses_of_its_samples(lens, pictures):
 @pytest.mark.slow
 def test_an_interrupted_training_as_built_resumes_bit_by_bit(lens, pictures, tmp_path):
     def trained(folder, stop=None):
-        own = camera(lens, BUILT)
+        own = initial_camera(lens, BUILT)
         own._order = 2
         run = Run(tmp_path / folder, dataclasses.asdict(BUILT))
         for step, _ in optimise(own, pictures, BUILT, run, every=2):
@@ -210,11 +218,11 @@ def test_an_interrupted_training_as_built_resumes_bit_by_bit(lens, pictures, tmp
 @pytest.mark.slow
 def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pictures):
     settings = dataclasses.replace(BUILT, crops=1)
-    built, count = camera(lens, settings), 2
+    built, count = initial_camera(lens, settings), 2
     built._order = 2
     found = errors_as_built(built, pictures, settings)
     assert [len(part) for part in found] == [count, count]
-    samples = batch(pictures, settings, list(range(4)), TEST_EPOCH)
+    samples = make_batch(pictures, settings, list(range(4)), TEST_EPOCH)
     drawn = rt.tolerancing.draw_errors(built.tolerances, count, first=2**62)
     assert len({tuple(row) for row in drawn.tolist()}) == count
     with torch.no_grad():
@@ -227,7 +235,7 @@ def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pict
             psnr = -10 * torch.log10(difference.square().mean())
             assert float(psnr) == pytest.approx(float(found[1][number]), abs=1e-4)
     nominal = dataclasses.replace(settings, as_built=False)
-    other = camera(lens, nominal)
+    other = initial_camera(lens, nominal)
     other._order = 2
     again = errors_as_built(other, pictures, nominal)
     assert torch.equal(torch.stack(again), torch.stack(found))  # of the same, untrained camera
@@ -264,7 +272,7 @@ def test_wrong_cameras_as_built_are_refused(lens):
     with pytest.raises(ValueError, match="errors of 3 lenses at 2 object distances"):
         built.kernels(DISTANCES[:2], 0, errors)
     with pytest.raises(ValueError, match="refocus 'gap': expected sensor or none"):
-        camera(lens, dataclasses.replace(BUILT, refocus="gap"))
+        initial_camera(lens, dataclasses.replace(BUILT, refocus="gap"))
 
 
 def test_a_sensor_in_colour_takes_lenses_as_built(lens):

@@ -28,9 +28,9 @@ from raytrace.imaging.codesign import (
     Batches,
     Outcome,
     absolute_error,
-    batch,
-    camera,
+    initial_camera,
     lens_at_start,
+    make_batch,
     optimise,
     outcome,
     run_model,
@@ -70,7 +70,7 @@ class Same(torch.nn.Module):
 @pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
 def test_kernels_are_those_of_the_psf_call(model):
     """A camera plans an order and reuses rays; its kernels stay within the tolerance it was given."""
-    own = camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, size=21))
+    own = initial_camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, size=21))
     distances = number([10e3, 17e3, 42e3, 50e3])
     found = own.kernels(distances)
     expected = psf(
@@ -83,7 +83,7 @@ def test_kernels_are_those_of_the_psf_call(model):
 
 @pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
 def test_derivative_in_the_sensor_through_picture_and_loss(model):
-    own = camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, tol=1e-3, noise=0.0))
+    own = initial_camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, tol=1e-3, noise=0.0))
     own.network = Same()
     picture = torch.rand(2, 22, 22, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     distances = number([12e3, 33e3])
@@ -102,7 +102,7 @@ def test_derivative_in_the_sensor_through_picture_and_loss(model):
 
 
 def test_image_is_the_picture_blurred_and_the_target_its_middle():
-    own = camera(read_lens(LENS), SMALL)
+    own = initial_camera(read_lens(LENS), SMALL)
     picture, distances = torch.rand(3, 22, 22), number([10e3, 20e3, 50e3])
     blurred = blur(picture[:, None], own.kernels(distances).float())
     torch.testing.assert_close(own.image(picture, distances), blurred)
@@ -178,22 +178,22 @@ def test_distance_in_focus_is_the_inverse_of_focusing():
 
 def test_samples_are_keyed_by_their_number():
     pictures = dead_leaves(2, size=48)
-    whole = batch(pictures, SMALL, [0, 1, 2, 3], epoch=1)
-    odd = batch(pictures, SMALL, [1, 3], epoch=1)
+    whole = make_batch(pictures, SMALL, [0, 1, 2, 3], epoch=1)
+    odd = make_batch(pictures, SMALL, [1, 3], epoch=1)
     assert torch.equal(whole.picture[1::2], odd.picture)
     assert torch.equal(whole.distance[1::2], odd.distance)
     assert torch.equal(whole.index[1::2], odd.index)
     assert 10e3 <= float(whole.distance.min()) <= float(whole.distance.max()) <= 50e3
     batches = Batches(pictures, SMALL)
-    assert torch.equal(batches(1, Share()).distance, batch(pictures, SMALL, [0, 1, 2, 3], epoch=1).distance)
+    assert torch.equal(batches(1, Share()).distance, make_batch(pictures, SMALL, [0, 1, 2, 3], epoch=1).distance)
     with pytest.raises(ValueError, match="do not fill one batch of 64"):
         Batches(pictures, dataclasses.replace(SMALL, batch=64))
 
 
 def test_losses_of_shares_add_up_to_that_of_the_batch():
     """What two processes sum is what one computes: to 1e-12 in double precision, gradients too."""
-    own = camera(read_lens(LENS), SMALL).double()
-    whole = batch(dead_leaves(2, size=48), SMALL, [0, 1, 2, 3], epoch=0)
+    own = initial_camera(read_lens(LENS), SMALL).double()
+    whole = make_batch(dead_leaves(2, size=48), SMALL, [0, 1, 2, 3], epoch=0)
     parts = [
         dataclasses.replace(
             whole,
@@ -213,13 +213,13 @@ def test_losses_of_shares_add_up_to_that_of_the_batch():
 @pytest.mark.slow
 def test_fields_take_turns():
     settings = dataclasses.replace(SMALL, fields=(0.0, 14.0), model="gaussian")
-    own = camera(read_lens(LENS), settings)
+    own = initial_camera(read_lens(LENS), settings)
     own.network = Same()
-    four = batch(dead_leaves(2, size=48), settings, [0, 1, 2, 3], epoch=0)
+    four = make_batch(dead_leaves(2, size=48), settings, [0, 1, 2, 3], epoch=0)
     assert four.field == [0, 1, 0, 1]
     errors = absolute_error(own, four)
     for i in range(4):
-        one = batch(dead_leaves(2, size=48), settings, [i], epoch=0)
+        one = make_batch(dead_leaves(2, size=48), settings, [i], epoch=0)
         torch.testing.assert_close(absolute_error(own, one)[0], errors[i], atol=2e-3, rtol=1e-4)
     assert float((own.kernels(number([2e4]), 0) - own.kernels(number([2e4]), 1)).abs().sum()) > 0.1
 
@@ -274,7 +274,7 @@ def test_a_run_begins_at_the_optimum_of_the_closed_form(tmp_path, vary, bounds):
     """The first row of the log is the lens before its first step."""
     settings = dataclasses.replace(SMALL, start="spectral", vary=vary, bounds=bounds, model="paraxial")
     pictures = split(dead_leaves(10, size=32))
-    own = camera(read_lens(LENS), settings)
+    own = initial_camera(read_lens(LENS), settings)
     begun = own.variables.numbers()
     course = optimise_closed_form(own, patch_spectrum(pictures[0], 22, crops=settings.crops))
     assert course.errors[-1] < 0.999 * course.errors[0]
@@ -326,16 +326,16 @@ def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
     """From the paraxial start both go towards the lens: to the bound, and no further."""
     settings = dataclasses.replace(SMALL, bounds="sensor:57.88,58", epochs=2)
     pictures = split(dead_leaves(10, size=32))[0]
-    steps = list(optimise(camera(read_lens(LENS), settings), pictures, settings, Run(tmp_path, {})))
+    steps = list(optimise(initial_camera(read_lens(LENS), settings), pictures, settings, Run(tmp_path, {})))
     free = dataclasses.replace(settings, bounds="")
-    beyond = list(optimise(camera(read_lens(LENS), free), pictures, free, Run(tmp_path / "free", {})))
+    beyond = list(optimise(initial_camera(read_lens(LENS), free), pictures, free, Run(tmp_path / "free", {})))
     assert beyond[-1][1]["sensor"] < 57.8793
     assert steps[-1][1]["sensor"] == pytest.approx(57.88, abs=1e-9)
-    own = camera(read_lens(LENS), settings)
+    own = initial_camera(read_lens(LENS), settings)
     optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert own.variables.numbers()["sensor"] == pytest.approx(57.88, abs=1e-9)
     with pytest.raises(BadVariables, match="`bounds` for thickness_5, not among"):
-        camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
+        initial_camera(read_lens(LENS), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
 
 
 def test_an_unbuildable_lens_has_a_penalty_and_is_pushed_back(tmp_path):
@@ -343,10 +343,10 @@ def test_an_unbuildable_lens_has_a_penalty_and_is_pushed_back(tmp_path):
     lens = read_lens(LENS)
     squeezed = lens.replace(2, thickness=number(-0.2))
     settings = dataclasses.replace(SMALL, vary="thickness:2", air_thickness="0.05:60")
-    own = camera(squeezed, settings)
+    own = initial_camera(squeezed, settings)
     pictures = split(dead_leaves(10, size=32))[0]
     with torch.no_grad():
-        image = float(absolute_error(own, batch(pictures, settings, [0, 1, 2, 3], 0)).sum()) / (4 * 16**2)
+        image = float(absolute_error(own, make_batch(pictures, settings, [0, 1, 2, 3], 0)).sum()) / (4 * 16**2)
     lacking = float(own.variables.violation().detach())
     assert lacking == pytest.approx(0.25**2, rel=1e-12)
     steps = list(optimise(own, pictures, settings, Run(tmp_path, {})))
@@ -356,7 +356,7 @@ def test_an_unbuildable_lens_has_a_penalty_and_is_pushed_back(tmp_path):
     places = [record["thickness_2"] for _, record in steps]
     assert all(after > before for before, after in itertools.pairwise(places))
     # In the closed form too: buildable again, but for what a gain of image is worth against the square.
-    own = camera(squeezed, settings)
+    own = initial_camera(squeezed, settings)
     course = optimise_closed_form(own, patch_spectrum(pictures, 22))
     assert course.penalties[0] == lacking
     assert course.penalties[-1] == float(own.variables.violation().detach()) < 1e-3
@@ -367,7 +367,9 @@ def test_an_optimum_at_the_end_of_its_range_is_none():
     """The least error lies near 57.79 mm: bounds that leave it out, on either side, hold no optimum."""
     S = patch_spectrum(dead_leaves(4, size=64), 22)
     for bounds, end in (("sensor:57.85,58", 57.85), ("sensor:57.6,57.7", 57.7)):
-        own = camera(read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", bounds=bounds, start="57.86"))
+        own = initial_camera(
+            read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", bounds=bounds, start="57.86")
+        )
         own.variables.project()
         course = optimise_closed_form(own, S, distances=even_distances(own, 5))
         assert own.variables.numbers()["sensor"] == pytest.approx(end, abs=1e-9)
@@ -380,7 +382,7 @@ def test_an_optimum_at_the_end_of_its_range_is_none():
 def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
     """20 mm behind all images windows hold but the middle of any blur, and the slope leads nowhere."""
     S = patch_spectrum(dead_leaves(4, size=64), 22)
-    own = camera(read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", start="80"))
+    own = initial_camera(read_lens(LENS), dataclasses.replace(SMALL, model="paraxial", start="80"))
     assert re.match(r"no optimum inside 57\.3\d* to 58\.5\d* mm of sensor distance", out_of_focus(own))
     course = optimise_closed_form(own, S, distances=even_distances(own, 5))
     assert course.no_optimum.endswith(f"went to {own.variables.numbers()['sensor']:.7g} mm")
@@ -408,12 +410,12 @@ def test_kernels_of_several_wavelengths_are_their_weighted_sum():
         settings = dataclasses.replace(
             SMALL, model="paraxial", start="57.8", wavelengths=colours, wavelength_weights=weights, normalise="energy"
         )
-        found[colours] = camera(read_lens(LENS), settings).kernels(distances)
+        found[colours] = initial_camera(read_lens(LENS), settings).kernels(distances)
     blue, red, both = found.values()
     torch.testing.assert_close(both, 0.25 * blue + 0.75 * red, rtol=0, atol=1e-6)
     assert float((blue - red).detach().abs().max()) > 1e-3
     with pytest.raises(ValueError, match="1 wavelength_weights for 2 wavelengths"):
-        camera(read_lens(LENS), dataclasses.replace(SMALL, wavelengths=(0.48, 0.62)))
+        initial_camera(read_lens(LENS), dataclasses.replace(SMALL, wavelengths=(0.48, 0.62)))
 
 
 @pytest.mark.slow
@@ -440,7 +442,7 @@ def test_rho_is_of_the_paraxial_model_alone(model):
     """σ = ρε: the second moment of a kernel grows with ρ², less that of the pixel; other models do not know it."""
     distances = number([20e3])
     narrow, wide = (
-        camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
+        initial_camera(read_lens(LENS), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
         for rho in (0.3, 0.6)
     )
     assert torch.equal(narrow, wide) == (model != "paraxial")
@@ -454,7 +456,7 @@ def test_rho_is_of_the_paraxial_model_alone(model):
 def test_training_moves_the_sensor_towards_less_loss(tmp_path):
     """From a sensor 0.3 mm too close, Adam moves away from the lens at 1 µm a step."""
     settings = dataclasses.replace(SMALL, start="57.3", epochs=5)
-    own = camera(read_lens(LENS), settings)
+    own = initial_camera(read_lens(LENS), settings)
     steps = list(optimise(own, split(dead_leaves(10, size=32))[0], settings, Run(tmp_path, {})))
     assert steps[-1][1]["sensor"] > 57.3 + 5 * MICROMETRE
 
@@ -465,7 +467,7 @@ def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
     S = patch_spectrum(dead_leaves(8, size=64), 48)
     places = {}
     for model in ("paraxial", "fourier", "gaussian"):
-        own = camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, size=21))
+        own = initial_camera(read_lens(LENS), dataclasses.replace(SMALL, model=model, size=21))
         course = optimise_closed_form(own, S, distances=even_distances(own, 9))
         assert min(course.errors) == pytest.approx(course.errors[-1], rel=1e-6)
         assert (course.no_optimum, course.at_end) == ("", ())
@@ -482,7 +484,7 @@ def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
 
 def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
     """A kernel at 14° against central differences: the chief ray moves by 0.25 mm per mm of the sensor."""
-    own = camera(read_lens(LENS), CodesignSettings(model="gaussian", fields=(0.0, 14.0), start="57.66"))
+    own = initial_camera(read_lens(LENS), CodesignSettings(model="gaussian", fields=(0.0, 14.0), start="57.66"))
     distances = number([1.2e4, 2e4, 4e4])
     sensor, pattern = own.variables.get_parameter("sensor"), torch.cos(torch.arange(441.0, dtype=torch.float64))
 
@@ -499,7 +501,7 @@ def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
 
 
 def test_models_without_distortion_are_centred_on_their_image():
-    own = camera(read_lens(LENS), CodesignSettings(model="paraxial", fields=(0.0, 14.0)))
+    own = initial_camera(read_lens(LENS), CodesignSettings(model="paraxial", fields=(0.0, 14.0)))
     distances = number([1.2e4, 2e4, 4e4])
     torch.testing.assert_close(own.kernels(distances, 1), own.kernels(distances, 0))
 
@@ -523,7 +525,7 @@ def test_the_window_follows_the_chief_ray_of_a_tilted_lens(points):
 
 @pytest.mark.parametrize("model", ["gaussian", "drt"])
 def test_a_kernel_does_not_depend_on_its_batch(model):
-    own = camera(read_lens(LENS), CodesignSettings(model=model, fields=(0.0, 7.0)))
+    own = initial_camera(read_lens(LENS), CodesignSettings(model=model, fields=(0.0, 7.0)))
     distances = number([1.2e4, 4e4])
     with torch.no_grad():
         kernels, other = own.kernels(distances, 1), own.kernels(number([-1.2e4, 4e4]), 1)
@@ -696,3 +698,8 @@ def test_a_state_keeps_an_order_that_is_given_and_the_sampling_of_an_element():
     alone[0].plan()
     alone[1].load_state_dict(alone[0].state_dict())
     assert alone[1]._sampling == alone[0]._sampling
+
+
+def test_a_camera_without_a_network_names_the_photograph():
+    with pytest.raises(TypeError, match=r"`network` is missing: .*rt.render\(lens, picture\)"):
+        Camera(Variables(read_lens(LENS), "sensor"), sensor=Sensor())

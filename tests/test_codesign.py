@@ -10,12 +10,12 @@ import torch
 
 from raytrace.imaging.closed_form import even_distances, scan
 from raytrace.imaging.codesign import (
-    batch,
-    camera,
     closed_form,
     default_settings,
     freeze_lens,
+    initial_camera,
     lens_at_start,
+    make_batch,
     optimise,
     pupil_points,
 )
@@ -69,7 +69,7 @@ def test_that_aperture_is_a_sharp_one_for_gaussian_drt(lens, textures, f_number,
 @pytest.mark.slow
 def test_drt_has_several_optima_there(lens, textures):
     """Downhill from 25 m lies one of 0.01222; near 57.59 mm the error is 7 % less, behind a hill."""
-    own = camera(lens, dataclasses.replace(FAST, model="drt"))
+    own = initial_camera(lens, dataclasses.replace(FAST, model="drt"))
     least, hill, local = scan(own, textures, [57.593, 57.83, 57.8824], even_distances(own))
     assert least == pytest.approx(0.01138, abs=1e-5)
     assert local == pytest.approx(0.01222, abs=1e-5)
@@ -91,7 +91,7 @@ def test_many_plain_rays_give_the_psf_and_its_slope(lens, model):
     """4096 of them: Gaussians to 0.3 %, all light to 8 %, what counting leaves; few rays are another PSF."""
     z = torch.tensor([12e3, 33e3], dtype=torch.float64)
     many, few, whole = (
-        camera(lens, dataclasses.replace(SMALL, size=21, model=model, rays=rays)) for rays in (4096, 12, None)
+        initial_camera(lens, dataclasses.replace(SMALL, size=21, model=model, rays=rays)) for rays in (4096, 12, None)
     )
     expected = whole.kernels(z)
     near = {"gaussian": 3e-3, "drt": 0.08}[model]
@@ -106,7 +106,7 @@ def test_many_plain_rays_give_the_psf_and_its_slope(lens, model):
 
 
 def test_a_gaussian_of_plain_rays_has_their_moments(lens):
-    own = camera(lens, dataclasses.replace(SMALL, size=21, rays=50))
+    own = initial_camera(lens, dataclasses.replace(SMALL, size=21, rays=50))
     kernel = own.kernels(torch.tensor([25e3], dtype=torch.float64))[0, 0]
     x = (torch.arange(21, dtype=torch.float64) - 10) * 0.005
     light = lens_at_start(lens, dataclasses.replace(SMALL, rays=50))
@@ -119,23 +119,25 @@ def test_a_gaussian_of_plain_rays_has_their_moments(lens):
 def test_plain_rays_are_of_the_first_step_alone(lens):
     """Step 2 asks what traced light really does: with as many rays as that takes."""
     z = torch.tensor([12e3], dtype=torch.float64)
-    own, usual_camera = (camera(lens, dataclasses.replace(SMALL, rays=rays)) for rays in (12, None))
+    own, usual_camera = (initial_camera(lens, dataclasses.replace(SMALL, rays=rays)) for rays in (12, None))
     for one in (own, usual_camera):
         freeze_lens(one, SMALL)
     assert torch.equal(own.kernels(z), usual_camera.kernels(z))
-    paraxial = camera(lens, dataclasses.replace(SMALL, model="paraxial", rays=12))
-    assert torch.equal(paraxial.kernels(z), camera(lens, dataclasses.replace(SMALL, model="paraxial")).kernels(z))
+    paraxial = initial_camera(lens, dataclasses.replace(SMALL, model="paraxial", rays=12))
+    assert torch.equal(
+        paraxial.kernels(z), initial_camera(lens, dataclasses.replace(SMALL, model="paraxial")).kernels(z)
+    )
 
 
 def test_plain_rays_of_drt_are_of_both_steps(lens):
     """With --drt-rays the same rays make the PSFs of step 2, of every model: dozens for Gaussians, hundreds for DRT."""
     z = torch.tensor([12e3, 40e3], dtype=torch.float64)
     few = dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61, drt_rays=271)
-    traced = camera(lens, dataclasses.replace(few, model="drt"))
-    plain = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", model="drt", rays=271))
+    traced = initial_camera(lens, dataclasses.replace(few, model="drt"))
+    plain = initial_camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", model="drt", rays=271))
     assert torch.equal(traced.kernels(z), plain.kernels(z))
     for model in ("paraxial", "gaussian", "drt"):
-        own = camera(lens, dataclasses.replace(few, model=model))
+        own = initial_camera(lens, dataclasses.replace(few, model=model))
         freeze_lens(own, few)
         assert torch.equal(own.kernels(z), traced.kernels(z)), model
 
@@ -143,8 +145,8 @@ def test_plain_rays_of_drt_are_of_both_steps(lens):
 def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):
     """Rings of an axial beam: the product of two error functions, where a rotated Gaussian needs a quadrature."""
     z = torch.tensor([12e3, 40e3], dtype=torch.float64)
-    own = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
-    tilted = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
+    own = initial_camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
+    tilted = initial_camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
     tilted.use(Gaussian(rays=tilted.psf_parameters.rays + 1e-7))  # no longer mirrored, the same to 1e-6
     assert float((own.kernels(z) - tilted.kernels(z)).abs().max().detach()) < 1e-6
 
@@ -155,13 +157,13 @@ def test_semi_diameters_vignette_where_asked(lens):
     settings = dataclasses.replace(SMALL, f_number=1.9, model="drt", normalise="energy", size=61)
     z = torch.tensor([25e3], dtype=torch.float64)
     whole, clipped = (
-        float(camera(lens, dataclasses.replace(settings, vignetting=word)).kernels(z).sum().detach())
+        float(initial_camera(lens, dataclasses.replace(settings, vignetting=word)).kernels(z).sum().detach())
         for word in ("none", "semi-diameters")
     )
     assert whole == pytest.approx(1.0, abs=0.02)
     assert clipped < 0.97 * whole
     at_f4 = dataclasses.replace(settings, f_number=4.0, vignetting="semi-diameters")
-    assert float(camera(lens, at_f4).kernels(z).sum().detach()) == pytest.approx(1.0, abs=0.02)
+    assert float(initial_camera(lens, at_f4).kernels(z).sum().detach()) == pytest.approx(1.0, abs=0.02)
 
 
 def test_where_plain_rays_cross_the_pupil():
@@ -174,12 +176,12 @@ def test_where_plain_rays_cross_the_pupil():
 
 
 def test_distances_even_in_their_reciprocal(lens):
-    own = camera(lens, SMALL)
+    own = initial_camera(lens, SMALL)
     z = even_distances(own, 4, spread="reciprocal")
     torch.testing.assert_close(1e6 / z, torch.tensor([90.0, 70.0, 50.0, 30.0], dtype=torch.float64))
     settings = dataclasses.replace(SMALL, spread="reciprocal")
     pictures, samples = dead_leaves(8, size=32), list(range(400))
-    drawn = torch.cat([batch(pictures, settings, samples[:16], epoch).distance for epoch in range(40)])
+    drawn = torch.cat([make_batch(pictures, settings, samples[:16], epoch).distance for epoch in range(40)])
     assert float((1e6 / drawn).mean()) == pytest.approx(60.0, rel=0.05)
     assert 10e3 <= float(drawn.min()) <= float(drawn.max()) <= 50e3
 
@@ -195,7 +197,7 @@ def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     pictures, settings = dead_leaves(8, size=32), dataclasses.replace(SMALL, decay="cosine", model="paraxial")
 
     def train(folder, most=99):
-        own = camera(lens, settings)
+        own = initial_camera(lens, settings)
         run = Run(tmp_path / folder, {})
         for _ in zip(range(most), optimise(own, pictures, settings, run, every=1), strict=False):
             pass

@@ -229,7 +229,7 @@ def test_the_closed_form_of_an_element_is_the_error_of_its_filtered_pictures(pla
     errors = []
     for depth in camera.filter.distances:
         for picture in pictures[:, None].expand(4, 3, 24, 24):
-            many = camera.recorded(camera.image(picture[None], depth).expand(40, -1, -1, -1), index=range(40))
+            many = camera.demosaiced(camera.image(picture[None], depth).expand(40, -1, -1, -1), index=range(40))
             errors.append((camera.restore(many) - picture).square().mean())
     assert torch.stack(errors).mean().item() == pytest.approx(expected.item(), rel=0.01)
 
@@ -326,12 +326,12 @@ def test_states_are_of_their_element():
     ("options", "message"),
     [
         ({"center": "centroid"}, "windows of a phase element are about the chief ray"),
-        ({"normalise": "energy"}, "leave it out; windows have sum 1"),
-        ({"normalise": "haze"}, "leave it out; windows have sum 1"),
-        ({"exact": True}, "exact of a camera with a lens"),
+        ({"normalise": "energy"}, "whose PSFs have sum 1: leave normalise out"),
+        ({"normalise": "haze"}, "whose PSFs have sum 1: leave normalise out"),
+        ({"exact": True}, "exact applies only to a phase element without a lens"),
         ({"boundary": "open"}, "boundary 'open': expected valid or circular"),
         ({"model": "gaussian"}, "model 'gaussian' with phase elements"),
-        ({"sensor_distance": 35.5}, "leave sensor_distance out"),
+        ({"sensor_distance": 35.5}, "a lens defines the sensor distance: leave sensor_distance out"),
         ({"wavelengths": (0.5,)}, "lens.at"),
     ],
 )

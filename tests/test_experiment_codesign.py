@@ -19,10 +19,10 @@ from raytrace.imaging.closed_form import even_distances, optimise_closed_form, p
 from raytrace.imaging.codesign import (
     Optimum,
     Outcome,
-    batch,
-    camera,
     closed_form,
+    initial_camera,
     lens_at_start,
+    make_batch,
     write_outcome,
 )
 from raytrace.imaging.pictures import dead_leaves
@@ -304,7 +304,7 @@ def spectrum(pictures):
 def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
     settings = dataclasses.replace(SMALL, model=model)
     found = closed_form(lens, settings, spectrum)
-    own = camera(lens, settings)
+    own = initial_camera(lens, settings)
     begun, distances = own.variables.numbers()["sensor"], even_distances(own)
     around = [found.sensor_mm + shift * MICROMETRE for shift in (-20, 0, 20)]
     low, least, high = scan(own, spectrum, around, distances)
@@ -352,7 +352,7 @@ def test_the_optimum_of_gaussian_drt_is_no_matter_of_where_it_begins(lens, pictu
     """To a micrometre. With little noise the first step of 1 mm that scipy would take lands behind another optimum."""
     spectrum, places = patch_spectrum(pictures, 36), []
     for start in starts:
-        own = camera(lens, dataclasses.replace(SMALL, size=21, noise=noise, start=start))
+        own = initial_camera(lens, dataclasses.replace(SMALL, size=21, noise=noise, start=start))
         optimise_closed_form(own, spectrum, distances=even_distances(own, 9))
         places.append(own.variables.numbers()["sensor"])
     assert max(places) - min(places) < MICROMETRE
@@ -376,9 +376,9 @@ def test_blur_of_an_almost_paraxial_lens_is_that_of_similar_triangles(lens):
 
 @pytest.mark.slow
 def test_time_of_a_step_leaves_the_cameras_as_they_were(lens, pictures):
-    cameras = [camera(lens, dataclasses.replace(SMALL, model=model)) for model in ("paraxial", "drt")]
+    cameras = [initial_camera(lens, dataclasses.replace(SMALL, model=model)) for model in ("paraxial", "drt")]
     before = [{key: value.clone() for key, value in own.state_dict().items()} for own in cameras]
-    found = step_times(cameras, batch(pictures, SMALL, [0, 1, 2, 3], 0), repeats=2)
+    found = step_times(cameras, make_batch(pictures, SMALL, [0, 1, 2, 3], 0), repeats=2)
     assert [one.model for one in found] == ["paraxial", "drt"]
     assert all(min(one.psf, one.image, one.network) > 0 for one in found)
     for own, state in zip(cameras, before, strict=True):

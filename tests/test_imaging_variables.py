@@ -9,7 +9,7 @@ from problems import focal_length
 
 import raytrace as rt
 from raytrace.imaging.closed_form import camera_error, even_distances, optimise_closed_form, patch_spectrum
-from raytrace.imaging.codesign import camera, closed_form, optimise
+from raytrace.imaging.codesign import closed_form, initial_camera, optimise
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import Run
 from raytrace.imaging.variables import OtherLens, Variables
@@ -75,7 +75,7 @@ def test_derivatives_through_the_solved_number(lens):
 
     given = [torch.full_like(one, 0.05).requires_grad_() for one in free.values()]
     assert gradcheck(numbers, given, eps=1e-5, rtol=1e-6)
-    own = camera(lens, dataclasses.replace(SMALL, model="gaussian"))
+    own = initial_camera(lens, dataclasses.replace(SMALL, model="gaussian"))
     spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
     own.plan()
     slope = torch.autograd.grad(camera_error(own, spectrum, distances), own.variables.thickness_2)[0]
@@ -157,7 +157,7 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
 def test_a_held_space_below_nothing_is_reported_with_the_end_of_the_sensor(lens):
     """It has no bounds of its own, while the sensor is at an end of its bounds."""
     bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
-    own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
+    own = initial_camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
     spectrum, distances = patch_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
     found = optimise_closed_form(own, spectrum, distances=distances)
     assert {"sensor", "thickness_6"} <= set(found.at_end)
@@ -168,7 +168,7 @@ def test_a_held_space_below_nothing_is_reported_with_the_end_of_the_sensor(lens)
 def test_training_holds_it(lens, tmp_path):
     """Every step of Adam, and a run that goes on knows its variables."""
     settings = dataclasses.replace(SMALL, model="gaussian", rate_optics=0.01)
-    own = camera(lens, settings)
+    own = initial_camera(lens, settings)
     records = [record for _, record in optimise(own, dead_leaves(8, size=48), settings, Run(tmp_path / "run", {}))]
     assert len(records) == 4
     assert records[-1]["thickness_6"] != records[0]["thickness_6"]

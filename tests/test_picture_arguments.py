@@ -83,7 +83,7 @@ REFUSED = {
     ),
     "0 to 255 in a camera": (
         lambda: camera()(255 * torch.rand(1, 24, 24), torch.tensor([10e3])),
-        r"values up to 25\d.*: expected 0 to 1, .*; divide it by its white",
+        r"values up to 25\d.*: expected 0 to 1, .*; divide it by the white level",
     ),
     "colours in the network": (
         lambda: rt.imaging.RedNet()(torch.rand(1, 3, 24, 24)),

@@ -41,10 +41,10 @@ from raytrace.imaging.codesign import (
     TEST_EPOCH,
     Batches,
     absolute_error,
-    batch,
-    camera,
+    initial_camera,
     lens_at_start,
     light_of,
+    make_batch,
     optimise,
     spectrum_of,
     steps_per_epoch,
@@ -111,7 +111,7 @@ class Study:
 
 def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, *, frozen: bool, count: int = 6) -> float:
     """Median processor time of a training step, s; frozen: of the network alone."""
-    trained = camera(lens, settings)
+    trained = initial_camera(lens, settings)
     trained.variables.requires_grad_(not frozen)
     trained.plan()
     batches = Batches(pictures, settings)
@@ -152,7 +152,7 @@ def trained_camera(study: Study, lens: Lens, name: str, arm: str, seed: int) -> 
     frozen = arm in ("spot", "closed form")
     if arm == "spot":
         lens, spent = for_spots(lens, settings)
-    one = camera(lens, settings)
+    one = initial_camera(lens, settings)
     if arm.startswith("closed form"):
         stored = folder / "closed_form.pt"
         if not stored.exists():
@@ -215,7 +215,7 @@ def refined(one: Camera, pictures: Pictures, settings: CodesignSettings, folder:
         taken = torch.as_tensor(draws(settings.seed, step, 78).integers(BANK, size=settings.batch))
         samples = batches(step, share)
         image = blur(samples.picture, bank[taken])
-        recorded = one.recorded(image, points[:, taken], samples.index, settings.seed)
+        recorded = one.demosaiced(image, points[:, taken], samples.index, settings.seed)
         difference = one.restore(recorded) - one.target(samples.picture)
         return difference.abs().mean(), {}
 
@@ -232,7 +232,7 @@ def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, setti
     """
     spectrum = spectrum_of(train_pictures, settings)
     filters = field_filters(one, spectrum, PLACES, even_distances(one, DISTANCES, spread=settings.spread))
-    samples, row = batch(test_pictures, settings, [*range(len(test_pictures))], TEST_EPOCH), {}
+    samples, row = make_batch(test_pictures, settings, [*range(len(test_pictures))], TEST_EPOCH), {}
     distances, count = even_distances(one, TESTED, spread=settings.spread), len(test_pictures)
     target = one.target(samples.picture)
     for place, filter in zip(PLACES, filters, strict=True):
@@ -240,7 +240,7 @@ def tested(one: Camera, train_pictures: Pictures, test_pictures: Pictures, setti
         kernels, errors = kernels_of(one, points.expand(2, TESTED), distances), {}
         for number, kernel in enumerate(kernels):
             image = blur(samples.picture, kernel)
-            recorded = one.recorded(image, points.expand(2, count), samples.index + number * count, settings.seed)
+            recorded = one.demosaiced(image, points.expand(2, count), samples.index + number * count, settings.seed)
             found = {"network": one.restore(recorded), "recorded": recorded}
             found["wiener"] = restore(recorded, filter.to(torch.complex64), boundary="taper")
             for name, estimate in found.items():
@@ -326,7 +326,7 @@ def draw_pictures(study: Study):
     """Scene, record, restorations and the residual of the network, at the middle and at the corner of the sensor."""
     folder = study.folder.parent / "apart" / "cooke_triplet" / "together" / "0"
     settings = study.settings("cooke_triplet", "together", 0)
-    one = camera(rt.read_lens("cooke_triplet"), settings)
+    one = initial_camera(rt.read_lens("cooke_triplet"), settings)
     load_state(one, read_state(folder / "step2" / "checkpoint.pt"), folder)
     one.use("drt")
     size = 96 + settings.size - 1
@@ -339,7 +339,7 @@ def draw_pictures(study: Study):
     axes = figure.subplots(2, 5)
     for row, (place, filter) in enumerate(zip((0.0, 1.0), filters, strict=True)):
         points = one.sensor.on_diagonal([place])
-        recorded = one.recorded(one.image(scene, distance, points=points), points, [row], 0)
+        recorded = one.demosaiced(one.image(scene, distance, points=points), points, [row], 0)
         target, network = one.target(scene), one.restore(recorded)
         wiener = restore(recorded, filter.to(torch.complex64), boundary="taper")
         shown = {"scene": target, "sensor": recorded, "network": network, "Wiener filter": wiener}

@@ -52,10 +52,10 @@ from raytrace.imaging.codesign import (
     OPTIMUM_COLUMNS,
     STEPS,
     Optimum,
-    batch,
-    camera,
     default_settings,
+    initial_camera,
     lens_at_start,
+    make_batch,
     outcome,
 )
 from raytrace.imaging.pictures import dead_leaves
@@ -357,8 +357,8 @@ def _report(
     say("the closed form, and the time of a step, of every model")
     spectrum = experiment.spectrum()
     optima = closed_forms(lens, settings, spectrum, rows)
-    cameras = [camera(lens, dataclasses.replace(settings, model=row)) for row in rows if row in MODELS]
-    times = runs.step_times(cameras, batch(experiment.train, settings, list(range(settings.batch)), 0))
+    cameras = [initial_camera(lens, dataclasses.replace(settings, model=row)) for row in rows if row in MODELS]
+    times = runs.step_times(cameras, make_batch(experiment.train, settings, list(range(settings.batch)), 0))
     drawn: dict[str, figures.Figure] = {}
     if joint := runs.courses(study, results, "loss", STEPS[0]):
         refined = runs.courses(study, results, "loss", STEPS[1])
@@ -470,7 +470,7 @@ def _scan(
     sensors = np.linspace(min(places) - margin, max(places) + margin, 41).tolist()
     errors = {}
     for model in [optimum.model for optimum in optima if optimum.model in MODELS]:
-        at_start = camera(lens, dataclasses.replace(settings, model=model))
+        at_start = initial_camera(lens, dataclasses.replace(settings, model=model))
         errors[model] = scan(at_start, spectrum, sensors, even_distances(at_start, spread=settings.spread))
     return sensors, errors
 

@@ -19,7 +19,14 @@ from scipy.stats import t as student
 
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.codesign import Batches, absolute_error, camera, errors_as_built, optimise, steps_per_epoch
+from raytrace.imaging.codesign import (
+    Batches,
+    absolute_error,
+    errors_as_built,
+    initial_camera,
+    optimise,
+    steps_per_epoch,
+)
 from raytrace.imaging.pictures import Pictures, digest, files, read, split
 from raytrace.imaging.training import Run, load_state, read_json, read_state
 from raytrace.io import as_lens
@@ -51,7 +58,7 @@ def settings_of(training: str, seed: int) -> CodesignSettings:
 
 def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, count: int = 8) -> float:
     """Median processor time of a training step, s."""
-    trained = camera(lens, settings)
+    trained = initial_camera(lens, settings)
     trained.plan()
     batches = Batches(pictures, settings, trained.tolerances if settings.as_built else None)
     optimizer, seconds = torch.optim.Adam(trained.parameters(), 0.0), []
@@ -70,7 +77,7 @@ def train_one(
     """Train, or what remains of it, from the end of the run in another folder; processor time in s."""
     run, spent = Run(folder, {**dataclasses.asdict(settings), **about}), folder / "seconds.json"
     done = read_json(spent)["seconds"] if spent.exists() else 0.0
-    trained, start = camera(lens, settings), time.process_time()
+    trained, start = initial_camera(lens, settings), time.process_time()
     trained.plan()
     if start_of is not None:
         load_state(trained, read_state(start_of / "checkpoint.pt"), start_of)
@@ -82,7 +89,7 @@ def train_one(
 def restored(lens: Lens, settings: CodesignSettings, folder: Path, build: str, psf: str) -> Camera:
     """A trained camera with the tolerances of a build."""
     grade, refocus = BUILDS[build]
-    tested = camera(lens, dataclasses.replace(settings, grade=grade, refocus=refocus))
+    tested = initial_camera(lens, dataclasses.replace(settings, grade=grade, refocus=refocus))
     tested.use(psf)
     tested.plan()  # at the start, so that all trainings have the same PSFs
     run = Run(folder, read_json(folder / "settings.json"))

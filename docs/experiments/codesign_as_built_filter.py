@@ -20,7 +20,7 @@ from torch import Tensor
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import even_distances, patch_spectrum
-from raytrace.imaging.codesign import TEST_EPOCH, batch, camera
+from raytrace.imaging.codesign import TEST_EPOCH, initial_camera, make_batch
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.pictures import Pictures, files, read, split
 from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, restore
@@ -65,10 +65,10 @@ def tested(built: Camera, pictures: Pictures, seed: int, sensor: float, filter: 
     built.variables.get_parameter("sensor").fill_(sensor - float(built.variables.lens.surfaces[-2].thickness))
     count = _PATCHES * _LENSES
     settings = dataclasses.replace(SETTINGS, seed=seed, crops=-(-count // len(pictures)))
-    samples = batch(pictures, settings, list(range(count)), TEST_EPOCH)
+    samples = make_batch(pictures, settings, list(range(count)), TEST_EPOCH)
     each = None if errors is None else errors.repeat_interleave(_PATCHES, 0)
     image = built.image(samples.picture.double(), samples.distance, 0, each)
-    image = built.recorded(image, index=samples.index, seed=samples.seed)
+    image = built.demosaiced(image, index=samples.index, seed=samples.seed)
     border = SETTINGS.size // 2
     inner = (..., slice(border, -border), slice(border, -border))
     difference = (restore(image, filter) - built.target(samples.picture.double()))[inner].reshape(_LENSES, -1)
@@ -85,7 +85,7 @@ def tested(built: Camera, pictures: Pictures, seed: int, sensor: float, filter: 
 def rows_of(lens: Lens, pictures: tuple[Pictures, Pictures], build: str, seed: int) -> list[dict]:
     """The rows of a build and a seed."""
     grade, refocus = BUILDS[build]
-    built = camera(lens, dataclasses.replace(SETTINGS, grade=grade, refocus=refocus))
+    built = initial_camera(lens, dataclasses.replace(SETTINGS, grade=grade, refocus=refocus))
     built.plan()
     spectrum = patch_spectrum(pictures[0], SETTINGS.patch, crops=1, seed=seed)
     errors = draw_errors(built.tolerances, _LENSES, seed)

@@ -22,12 +22,12 @@ from raytrace.imaging.codesign import (
     Batch,
     Optimum,
     Outcome,
-    batch,
     closed_form,
     freeze_lens,
+    initial_camera,
+    make_batch,
     outcome,
 )
-from raytrace.imaging.codesign import camera as camera_at_start
 from raytrace.imaging.image import blur
 from raytrace.imaging.pictures import Pictures
 from raytrace.imaging.training import load_state, read_log, read_state
@@ -187,7 +187,7 @@ def distance_rows(results: Sequence[Outcome]) -> Iterator[dict[str, str | float]
 
 def trained(lens: Lens, settings: CodesignSettings, folder: Path) -> Camera:
     """The camera at the end of a finished run, with DRT PSFs. settings: those of the run."""
-    camera = camera_at_start(lens, settings)
+    camera = initial_camera(lens, settings)
     checkpoint = Path(folder) / STEPS[1] / "checkpoint.pt"
     load_state(camera, read_state(checkpoint), checkpoint)
     freeze_lens(camera, settings)
@@ -212,12 +212,12 @@ def examples(
     camera: Camera, pictures: Pictures, settings: CodesignSettings, distances: Sequence[float]
 ) -> dict[str, Tensor]:
     """The test patch of the highest contrast at several distances (Z,): "picture", "image", "restored", (Z, h, w)."""
-    patches = batch(pictures, settings, list(range(min(_PATCHES, len(pictures) * settings.crops))), TEST_EPOCH)
+    patches = make_batch(pictures, settings, list(range(min(_PATCHES, len(pictures) * settings.crops))), TEST_EPOCH)
     chosen = int(patches.picture.flatten(1).std(1).argmax())
     distances = torch.tensor(distances, dtype=camera.fields.dtype)
     picture = patches.picture[chosen].expand(len(distances), -1, -1, -1)
     index = patches.index[[chosen] * len(distances)]
-    image = camera.recorded(camera.image(picture, distances), index=index, seed=patches.seed)
+    image = camera.demosaiced(camera.image(picture, distances), index=index, seed=patches.seed)
     shown = {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}
     return {name: images[:, 0] for name, images in shown.items()}
 

@@ -22,8 +22,8 @@ from raytrace.imaging.codesign import (
     STEPS,
     Optimum,
     Outcome,
-    camera,
     closed_form,
+    initial_camera,
     lens_at_start,
     network_at_start,
     outcome,
@@ -88,7 +88,7 @@ def open_experiment(
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
     field_points(settings.fields, like=lens)  # refuses angles of 90 degrees
     try:
-        camera(lens, settings)  # refuses bad variables, starts and networks
+        initial_camera(lens, settings)  # refuses bad variables, starts and networks
     except NoImage as error:
         message = "give --near, --far and --focus-distance beyond the focal length"
         raise CommandError(f"{arguments.lens}: {error}; {message}") from error

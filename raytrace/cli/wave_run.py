@@ -206,7 +206,7 @@ def captured_and_restored(
     """
     camera = config.camera(parts, boundary="reflect")
     if simulate is not None:
-        (image,) = camera.recorded(camera.image(image[None], [simulate]), index=[0], seed=seed)
+        (image,) = camera.demosaiced(camera.image(image[None], [simulate]), index=[0], seed=seed)
     shape = tuple(extent + config.size - 1 for extent in image.shape[-2:])
     S = power_law(shape, mean=float(image.mean()), deviation=max(float(image.std()), config.noise))
     (G,) = field_filters(camera, S, [0.0], config.depths)

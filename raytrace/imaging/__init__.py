@@ -8,7 +8,7 @@
 | render          | pictures of a lens over its sensor; field_kernels, varying_blur, warp: PSFs, distortion |
 | sensor          | pixels and their field points, Bayer mosaic, capture; spectral_response: of its channels |
 | restoration     | linear filters (Wiener) and their errors in closed form                                 |
-| filters         | filters of a camera that follow from its current kernels                                |
+| camera_filters  | filters of a camera that follow from its current kernels                                |
 | lens_pictures   | pictures of small scenes by a lens, for losses of `rt.optimize`                         |
 | network         | RED-Net and a small U-Net                                                               |
 | pictures        | folders of photographs, dead-leaves images                                              |

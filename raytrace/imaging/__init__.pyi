@@ -1,6 +1,6 @@
 from raytrace.imaging.camera import Camera as Camera
-from raytrace.imaging.filters import DepthInvariantFilter as DepthInvariantFilter
-from raytrace.imaging.filters import TowardsMeasurement as TowardsMeasurement
+from raytrace.imaging.camera_filters import DepthInvariantFilter as DepthInvariantFilter
+from raytrace.imaging.camera_filters import TowardsMeasurement as TowardsMeasurement
 from raytrace.imaging.image import add_noise as add_noise
 from raytrace.imaging.image import add_shot_noise as add_shot_noise
 from raytrace.imaging.image import blur as blur

@@ -17,14 +17,14 @@ A training step of lens and network, in colour, at random places of the sensor:
     optimizer.step()
     camera.variables.project()                               # onto the bounds, if there are any
 
-Or the lens by steps of second order, under its bounds and conditions, and the network by an optimiser of torch:
+Alternatively `lens_step` takes second-order steps of the lens within bounds and conditions; torch trains the network:
 
     def loss():
         return (camera(pictures, distances, points=points, index=index) - camera.target(pictures)).abs().mean()
 
     camera.lens_step(loss)
 
-Grey pictures, (B, H, W), of field points by their numbers, as in studies of a few points of a scene:
+Monochrome images (B, H, W) at field points, which are selected by their index:
 
     grey = rt.Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1)
     camera = rt.Camera(rt.Variables(lens, "sensor"), rt.imaging.RedNet(), sensor=grey, fields=[0, 14])
@@ -35,7 +35,7 @@ A phase element at the stop, whose heights are learned with the lens, or an elem
     camera = rt.Camera(rt.Variables(lens, "sensor"), network, element=rt.imaging.PhaseVariables(element), sensor=sensor)
     camera = rt.Camera(rt.imaging.PhaseVariables(element), network, sensor_distance=35.5, sensor=sensor)
 
-Of an element alone the pictures may be periods of an endless one, without a border:
+For a phase element without a lens, pictures may be periodic:
 
     camera = rt.Camera(…, boundary="circular", normalise="haze", filter=DepthInvariantFilter(spectrum, distances))
 """
@@ -51,6 +51,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.built_lens import lens_as_built, sensor_compensator
+from raytrace.imaging.camera_filters import LinearFilter
 from raytrace.imaging.field_kernels import (
     ElementKernels,
     EnergyOutside,
@@ -66,7 +67,6 @@ from raytrace.imaging.field_kernels import (
     order_of,
     warn_of_dark_places,
 )
-from raytrace.imaging.filters import LinearFilter
 from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions
 from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
@@ -75,7 +75,7 @@ from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
 from raytrace.maths.numerics import as_tensor, uncompiled
 from raytrace.maths.result import plain
-from raytrace.psf_models import MODELS, NotConverged, model_of, name_of
+from raytrace.psf_models import MODELS, NotConverged, model_name, model_of, name_of
 from raytrace.system.identity import alike
 from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
@@ -87,12 +87,12 @@ from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.plan import plan as sampling_plan
-from raytrace.words import calling_level, named_value
+from raytrace.words import calling_level, former_name, named_value
 
 #: The variables of a camera: of a lens, or of a phase element without one.
 V = TypeVar("V", bound=Variables | PhaseVariables)
 
-_NEAREST = 0.01  # of the nearest object distance of a camera: nearer ones are meant in another unit
+_NEAREST = 0.01  # fraction of the nearest object distance of a camera; smaller distances indicate a wrong unit
 _OUTSIDE = 0.1  # of the light outside the window, which kernels of sum 1 hide
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
@@ -103,30 +103,31 @@ class Camera(nn.Module, Generic[V]):
     Images are (B, C, H, W), linear in light, of the C channels of the sensor's response; of one channel also (B, H, W),
     or (H, W) for all object distances.
 
-    variables: of the lens, or of a phase element without a lens, `sensor_distance` mm before the sensor, at wavelengths
-    (W,) µm as for `render`, by the true spheres with `exact`; element: variables of one at the stop of the lens.
-    network: (B, C, h, w) -> the same; sensor: gives the images its response, noise, quantisation and mosaic; by
-    default `rt.Sensor()`, grey and without noise. Whole pictures: see `render`.
+    variables: `Variables` of a lens, or `PhaseVariables` of a phase element without a lens, which is `sensor_distance`
+    mm before the sensor, at wavelengths (W,) µm as for `render`; exact: its spherical wavefronts instead of the Fresnel
+    approximation. element: `PhaseVariables` of an element at the stop of the lens. network: maps (B, C, h, w) to the
+    same shape. sensor: gives the images its response, noise, quantisation and mosaic; by default `rt.Sensor()`,
+    monochrome and without noise. Whole pictures: see `render`.
     model: a PSF model or its name, by default "gaussian", with elements "wave". Gaussian(rays=points) and
     DRT(rays=points) take the rays of these pupil points, instead of as many as `tol` needs.
-    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field:
-    places of images, which move with the image of the field point. By default those of the centre of the sensor, of 0.7
-    and of 1 of its half diagonal, whose images stay at these points of it; without a sensor the axis.
+    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
+    whose image positions follow the chief ray while the lens changes. Default: 0, 0.7 and 1 of the half diagonal of the
+    sensor, fixed on the sensor; on axis without a sensor.
     pixels: of the sensor across the PSF window, an odd number, 21 by default.
-    center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`): a displaced image is no
-    error. normalise: "window" (PSFs of sum 1; `energy_outside` is the share of the light that they leave out) or
-    "energy" (of the share of the light through the entrance pupil); with elements alone also "haze": "energy", and the
-    light outside the window is spread evenly over the image.
+    center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`), which the window follows,
+    so that displacement of the image is not counted as blur. normalise: "window" (PSFs of sum 1; `energy_outside` is
+    the share of the light that they leave out) or "energy" (the sum is the share of the light through the entrance
+    pupil); of elements alone also "haze": as "energy", and the light outside the window becomes a uniform background.
     boundary: of pictures, as for `blur`: "valid", images are smaller by `margin`; "circular", pictures are periods of
     an endless one; or they are extended. illumination: images have the relative illumination of their places, too.
-    filter: of elements alone, a linear filter of the image before the network, that follows from the kernels of its
-    distances (`filters`).
+    filter: of elements alone, a linear filter of the image before the network, computed from the PSFs at its object
+    distances (`camera_filters`).
     tol: allowed error of the kernels: the order of the PSF model is chosen once, for the lens at the first call
-    (`plan`); with elements alone every call has a sampling of its own until `plan` fixes it.
+    (`plan`); with elements alone each call chooses its sampling until `plan` fixes it.
     network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
-    tolerances: of the lens as built: calls then take `errors` (N,) of one lens for all images, or (B, N), a lens for
-    each, of `draw_errors(tolerances, …)`. Every lens is focused again by its sensor distance where that is the
-    compensator of the tolerances: it moves by as much as the errors move the best focus over the fields.
+    tolerances: manufacturing tolerances. Calls then accept `errors` of `draw_errors(tolerances, …)`, (N,) for one
+    perturbed lens or (B, N), one lens per image. If the sensor distance is the compensator of the tolerances, each lens
+    is refocused by the shift of its best focus over the fields.
     The object is planar and upright; image inversion and magnification are ignored. `state_dict` describes the lens,
     its variables and the sensor, and loads only into a camera with the same ones; it holds the order of the PSF model
     and the curvature of `lens_step`, so that a resumed training is bit-identical.
@@ -144,7 +145,7 @@ class Camera(nn.Module, Generic[V]):
     def __init__(
         self,
         variables: V,
-        network: nn.Module,
+        network: nn.Module | None = None,
         *,
         sensor: Sensor | None = None,
         element: PhaseVariables | None = None,
@@ -169,6 +170,11 @@ class Camera(nn.Module, Generic[V]):
             kind = named_value(variables)
             expected = "the Variables of a lens: Variables(lens, …), or of an element: PhaseVariables(element)"
             raise TypeError(f"Camera: `variables` is {kind}; expected {expected}")
+        if network is None:
+            raise TypeError(
+                "Camera: `network` is missing: give a module, as rt.imaging.RedNet() or torch.nn.Identity(); a "
+                "photograph alone is rt.render(lens, picture)"
+            )
         self.variables, self.element, self.network = variables, element, network
         self._steps: LensSteps | None = None
         self.range, self.sensor, self.illumination = object_distances, sensor or Sensor(), illumination
@@ -195,15 +201,20 @@ class Camera(nn.Module, Generic[V]):
         if self.element is not None and not isinstance(self.element, PhaseVariables):
             raise TypeError(f"Camera: `element` is {named_value(self.element)}; expected PhaseVariables(element)")
         if is_alone and self.element is not None:
-            raise ValueError("two elements without a lens: give the second one in others=… of PhaseVariables")
+            raise ValueError(
+                "variables and element are both phase elements: give the second one as PhaseVariables(…, others=…)"
+            )
         if is_alone != (self.sensor_distance is not None):
-            needed = "give sensor_distance=…, mm" if is_alone else "leave sensor_distance out: the lens has it"
-            raise ValueError(f"a camera {'of an element without' if is_alone else 'with'} a lens: {needed}")
+            raise ValueError(
+                "a phase element without a lens requires sensor_distance=…, mm"
+                if is_alone
+                else "a lens defines the sensor distance: leave sensor_distance out"
+            )
         if self.wavelengths is not None and not is_alone:
-            raise ValueError("wavelengths of a camera with a lens: give lens.at(wavelengths=…)")
+            raise ValueError("wavelengths applies only to a phase element without a lens: give lens.at(wavelengths=…)")
         if not is_alone and (self.exact or self.filter is not None):
             option = "exact" if self.exact else "filter"
-            raise ValueError(f"{option} of a camera with a lens: expected an element alone; leave {option} out")
+            raise ValueError(f"{option} applies only to a phase element without a lens: leave {option} out")
 
     def lens(self) -> Lens:
         """The current lens; of an element without one, the stop that it is in."""
@@ -227,15 +238,15 @@ class Camera(nn.Module, Generic[V]):
             if word not in known:
                 raise ValueError(f"{name} {word!r}: expected {' or '.join(known)}")
         if isinstance(self.size, bool) or not isinstance(self.size, int) or self.size < 1 or self.size % 2 == 0:
-            raise ValueError(f"pixels {self.size!r}: expected an odd number of pixels of the sensor")
+            raise ValueError(f"pixels {self.size!r}: expected an odd integer ≥ 1, the width of the PSF window")
         if self.center == "centroid" and has_points(self.psf_parameters):
-            raise ValueError("windows of the rays of pupil points are about the chief ray: give center chief")
+            raise ValueError("center centroid is not supported with fixed pupil points (rays): give center chief")
         if self.elements() and self.center != "chief":
-            raise ValueError("windows of a phase element are about the chief ray: leave center out")
+            raise ValueError(f"center {self.center!r} is not supported with a phase element: leave center out")
         if self.element is not None and self.normalise != "window":
             raise ValueError(
-                f"normalise {self.normalise!r} with a phase element at the stop of a lens: leave it out; windows have "
-                "sum 1"
+                f"normalise {self.normalise!r} is not supported with a phase element at the stop, whose PSFs have sum "
+                "1: leave normalise out"
             )
         if self.normalise == "haze" and (self.illumination or not isinstance(self.variables, PhaseVariables)):
             raise ValueError("normalise 'haze': expected an element without a lens, and no illumination")
@@ -273,13 +284,14 @@ class Camera(nn.Module, Generic[V]):
         return groups
 
     def lens_step(self, loss: Callable[[], Tensor]) -> float:
-        """Take a step of second order of the variables of the lens that lowers a loss; its value before the step.
+        """Take one second-order step of the lens variables that lowers a loss; returns the loss before the step.
 
         loss: a function without arguments, as
-        lambda: (camera(pictures, distances, index=index) - camera.target(pictures)).square().mean(). It is called at
-        trial lenses, too: give `index`, so that all have the same noise. The step is within the bounds and meets the
-        conditions of the variables, without `project`; an optimiser of the network takes its steps in between. Warns
-        Unbuildable once where a step leads to a lens that cannot be made, as the loss and the conditions allow it.
+        lambda: (camera(pictures, distances, index=index) - camera.target(pictures)).square().mean(). It is also
+        evaluated at trial lenses: give `index`, so that all have the same noise. The step is within the bounds and
+        meets the conditions of the variables, without `project`; an optimiser of the network takes its steps in
+        between. Warns Unbuildable once where a step leads to a lens that cannot be made, as the loss and the conditions
+        allow it.
         """
         if not isinstance(self.variables, Variables):
             raise ValueError("lens_step: the camera has a phase element without a lens; take a step of its heights")
@@ -295,7 +307,7 @@ class Camera(nn.Module, Generic[V]):
         return before
 
     def __getstate__(self) -> dict:
-        """The state without the last steps of the lens, of which only the next step would know."""
+        """The state without the step history of `lens_step`."""
         return {**vars(self), "_steps": None}
 
     # -- states that describe themselves -------------------------------------------------------------------------------
@@ -347,7 +359,7 @@ class Camera(nn.Module, Generic[V]):
             before, now = decoded_text(stored), self.description()
             for name in ("sensor", "window", "sensor_distance"):
                 if not alike(before.get(name), now[name]):
-                    raise OtherLens(f"the state is of {_difference(name, before.get(name), now[name])}")
+                    raise OtherLens(_difference(name, before.get(name), now[name]))
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *lists)
         if stored is None and prefix + KEY in missing:  # of an older version
             missing.remove(prefix + KEY)
@@ -360,7 +372,8 @@ class Camera(nn.Module, Generic[V]):
     def use(self, model: str | Model) -> None:
         """Simulate with another PSF model, given by its name or with its parameters."""
         if isinstance(model, str):
-            self.model, self.psf_parameters = model, None if model not in MODELS else model_of(model)
+            self.model = model_name(model)
+            self.psf_parameters = model_of(self.model)
         else:
             self.model, self.psf_parameters = name_of(model), model
         self._order, self._sampling = getattr(self.psf_parameters, "order", None), None
@@ -382,8 +395,8 @@ class Camera(nn.Module, Generic[V]):
         By default at the ends and the middle of the range. With elements alone their sampling is fixed; the order is 0.
         """
         near, far = self.range
-        usual = (near, 2 / (1 / near + 1 / far), far)
-        distances = self._distances(usual if object_distances is None else object_distances)
+        default_distances = (near, 2 / (1 / near + 1 / far), far)
+        distances = self._distances(default_distances if object_distances is None else object_distances)
         if isinstance(self.variables, PhaseVariables):
             self._sampling = sampling_plan(self.element_kernels(distances).scene)
             return 0
@@ -406,8 +419,8 @@ class Camera(nn.Module, Generic[V]):
         distances, elements = self._distances(object_distances), self.elements(draw=draw)
         lens = element_in_stop(elements, self.sensor, self.sensor_distance, self.wavelengths)
         weights = self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
-        numbers = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
-        return ElementKernels(lens, elements, *numbers)
+        arguments = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
+        return ElementKernels(lens, elements, *arguments)
 
     @uncompiled
     def kernels(
@@ -421,12 +434,12 @@ class Camera(nn.Module, Generic[V]):
     ) -> Tensor:
         """PSFs (B, C, rows, columns) of object distances (B,) mm, of the channels of the sensor.
 
-        object_distances: a tensor, a sequence, or one number for all places. field: number of one of the camera's
-        `fields`, or (B,) numbers; points: instead, places (2, B) mm on the sensor. errors: of manufacture, (N,) of one
-        lens or (B, N); the object points are those that the nominal lens images at these places. PSFs are 0 where no
+        object_distances: a tensor, a sequence, or one number for all images. field: index of one of the camera's
+        `fields`, or (B,) indices; points: instead, sensor positions (2, B) mm. errors: of manufacture, (N,) of one
+        lens or (B, N); the object points are those that the nominal lens images at these positions. PSFs are 0 where no
         light arrives, with the warning DarkPlaces. Of PSFs of sum 1, EnergyOutside warns once, where more than 10 % of
         the light is outside the window. draw: of an element alone, generator of errors of fabrication. Raises
-        ValueError for places beyond the sensor and other shapes.
+        ValueError for positions beyond the sensor and other shapes.
         """
         is_of_sum_1 = self.normalise == "window"
         kernels, lens, points = self._kernels(
@@ -494,11 +507,11 @@ class Camera(nn.Module, Generic[V]):
             self._check_on_sensor(points)
             points, lens = points.to(self.fields), by_angle(nominal)
         built = None if errors is None else self._built(nominal, errors)
-        about: FieldKernels | ElementKernels
+        kernel_source: FieldKernels | ElementKernels
         if isinstance(self.variables, PhaseVariables):
-            about = self.element_kernels(distances, draw=draw)
+            kernel_source = self.element_kernels(distances, draw=draw)
         else:
-            about = FieldKernels(
+            kernel_source = FieldKernels(
                 lens,
                 self.sensor,
                 self.model,
@@ -511,11 +524,11 @@ class Camera(nn.Module, Generic[V]):
                 center=self.center,
                 memo=self._memo if points is None and errors is None else None,
             )
-        about = dataclasses.replace(about, normalise=normalise)
-        if isinstance(about, ElementKernels):  # alike at all places
-            kernels = about.paired(self.fields)
+        kernel_source = dataclasses.replace(kernel_source, normalise=normalise)
+        if isinstance(kernel_source, ElementKernels):  # shift-invariant PSF
+            kernels = kernel_source.paired(self.fields)
         elif errors is None and points is not None:
-            kernels = about.paired(points)
+            kernels = kernel_source.paired(points)
         else:
             at_field = self._of_field(self.fields, field, count)
             fields = at_field if points is None else self.sensor.fields(lens, points)
@@ -524,9 +537,11 @@ class Camera(nn.Module, Generic[V]):
                     raise ValueError(
                         f"errors of {built.count} lenses at {count} object distances: expected one for each"
                     )
-                about = dataclasses.replace(about, lens=by_angle(built) if points is not None else built)
+                kernel_source = dataclasses.replace(
+                    kernel_source, lens=by_angle(built) if points is not None else built
+                )
             arrives = ~fields.isnan().any(0)
-            kernels = about.of_pairs(fields.nan_to_num(0.0))
+            kernels = kernel_source.of_pairs(fields.nan_to_num(0.0))
             kernels = torch.where(arrives[:, None, None, None], kernels, 0.0)
         return kernels, lens, points
 
@@ -584,8 +599,8 @@ class Camera(nn.Module, Generic[V]):
         if bool((distances.detach().abs() < _NEAREST * near).any()):
             least = float(distances.detach().abs().min())
             raise ValueError(
-                f"object_distances of {least:g} mm, and the camera's are {near:g} to {max(self.range):g} mm: give mm, "
-                "or object_distances=(nearest, furthest) of the camera"
+                f"object distance {least:g} mm is below {100 * _NEAREST:g} % of the camera's range, {near:g} to "
+                f"{max(self.range):g} mm: give mm, or Camera(…, object_distances=(nearest, furthest))"
             )
         return distances.reshape(-1)
 
@@ -601,15 +616,15 @@ class Camera(nn.Module, Generic[V]):
         """The noise-free sensor image, (B, C, H - margin, W - margin); the margin is 0 unless the boundary is "valid".
 
         picture: (B, C, H, W) in [0, 1], centred at the places that field, points and errors give, as for `kernels`;
-        integers of 8 or 16 bits are levels of sRGB (`linearised`). Pictures of half precision are blurred in float32,
-        which the image has. Raises ValueError for other shapes and other ranges, as 0 to 255.
+        integers of 8 or 16 bits are levels of sRGB (`linearised`). Half-precision pictures are blurred in float32; the
+        image is float32. Raises ValueError for other shapes and other ranges, as 0 to 255.
         """
         distances = self._distances(object_distances)
         picture = self._of_channels(picture, distances)
         return self.blurred(picture, self.kernels(distances, field, errors, points=points))
 
     def blurred(self, light: Tensor, kernels: Tensor) -> Tensor:
-        """Light (B, C, H, W) behind kernels (B, C, h, w) of the camera, continued by its boundary, with its haze."""
+        """Light (B, C, H, W) convolved with kernels (B, C, h, w), with the boundary extension and haze background."""
         light = light.to(torch.promote_types(light.dtype, torch.float32))
         kernels = kernels.to(light.dtype)
         image = blur(light, kernels, boundary=self.boundary)
@@ -637,7 +652,8 @@ class Camera(nn.Module, Generic[V]):
             )
         if (most := float(light.detach().max())) > _LARGEST:
             raise ValueError(
-                f"a picture with values up to {most:g}: expected 0 to 1, as noise assumes; divide it by its white"
+                f"a picture with values up to {most:g}: expected 0 to 1, as the noise model takes 1 as white; "
+                "divide it by the white level"
             )
         return light
 
@@ -659,7 +675,7 @@ class Camera(nn.Module, Generic[V]):
             return render(self.variables(), scene, depth=depth, elements=self.elements(), **options)
         if self.exact:
             raise ValueError(
-                "render of a camera with exact spheres: pictures are computed by paraboloids; leave exact out"
+                "render does not support exact=True: it uses the Fresnel approximation; build the camera without exact"
             )
         alone = {"sensor_distance": self.sensor_distance, "wavelengths": self.wavelengths, "size": self.size}
         return render(self.elements(), scene, depth=depth, **{**alone, **options})
@@ -690,19 +706,19 @@ class Camera(nn.Module, Generic[V]):
         index: Tensor | Sequence[int] | None = None,
         seed: int = 0,
     ) -> Tensor:
-        """Blur, record, restore: arguments as for `image`; index, seed: of the noise, as for `recorded`."""
+        """Blur, record, restore: arguments as for `image`; index, seed: of the noise, as for `demosaiced`."""
         image = self.image(picture, object_distances, field, errors, points=points)
-        return self.restore(self.recorded(image, points, index, seed))
+        return self.restore(self.demosaiced(image, points, index, seed))
 
     @uncompiled
-    def recorded(
+    def demosaiced(
         self,
         image: Tensor,
         points: Tensor | None = None,
         index: Tensor | Sequence[int] | None = None,
         seed: int = 0,
     ) -> Tensor:
-        """The sensor's record (B, C, h, w) of noise-free images, interpolated where it has a mosaic.
+        """Noise-free images as the sensor captures them, (B, C, h, w), the missing colours of a mosaic interpolated.
 
         points: (2, B) mm of their centres, by default the middle of the sensor; index, seed: of the noise, see
         `Sensor.capture`, by default random numbers of torch's generator.
@@ -715,16 +731,20 @@ class Camera(nn.Module, Generic[V]):
         origin = (first + 1e-6).floor().long().expand(len(image), 2)
         return self.sensor.demosaic(self.sensor.capture(image, index, seed, origin), origin)
 
+    recorded = former_name("recorded", "demosaiced")
+
     def target(self, picture: Tensor) -> Tensor:
-        """The ideal output (B, C, h, w): the light of the picture without its margin."""
+        """Reference output (B, C, h, w): the light of the picture cropped by the margin."""
         edge, light = self.margin // 2, self._light(picture)
         return light[..., edge : light.shape[-2] - edge, edge : light.shape[-1] - edge]
 
 
 def _difference(name: str, before: object, now: object) -> str:
-    """The first difference of a stored sensor or window from this one."""
+    """The first difference of a stored sensor, window or sensor distance from this one, as a message."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in now:
             if not alike(before.get(key), now[key]):
-                return f"a sensor of {key} {before.get(key)}, not {now[key]}"
-    return f"a camera of {name} {before}, not {now}"
+                return _difference(f"sensor.{key}", before.get(key), now[key])
+    return (
+        f"the state is of a camera with {name} = {before}, this one has {now}: build the camera with the stored value"
+    )

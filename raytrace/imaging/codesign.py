@@ -179,7 +179,7 @@ def model_at(name: str, settings: CodesignSettings) -> Model:
     return model_of(name) if points is None else model_of(name, rays=points)
 
 
-def camera(lens: Lens, settings: CodesignSettings) -> Camera[Variables]:
+def initial_camera(lens: Lens, settings: CodesignSettings) -> Camera[Variables]:
     """The camera of an experiment at its start."""
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
@@ -214,7 +214,7 @@ def with_catalog_glasses(
     again = dataclasses.replace(
         settings, vary=" ".join(words), hold=hold, epochs=settings.relearn, start=repr(sensor), relearn=0
     )
-    with_glasses = camera(lens, again)
+    with_glasses = initial_camera(lens, again)
     with_glasses.network.load_state_dict(trained.network.state_dict())
     with_glasses.plan()
     return with_glasses, again
@@ -261,7 +261,7 @@ class Batch:
         return {name: getattr(self, name) for name in names}
 
 
-def batch(
+def make_batch(
     pictures: Pictures,
     settings: CodesignSettings,
     samples: list[int],
@@ -343,7 +343,7 @@ class Batches:
         epoch, place = divmod(step, self.steps_per_epoch)
         first = place * self.settings.batch
         samples = share.of(range(first, first + self.settings.batch))
-        return self._thread.submit(batch, self.pictures, self.settings, samples, epoch, self.tolerances)
+        return self._thread.submit(make_batch, self.pictures, self.settings, samples, epoch, self.tolerances)
 
 
 def absolute_error(camera: Camera, batch: Batch) -> Tensor:
@@ -403,7 +403,7 @@ def held_out_error(
     """
     count, total = len(pictures) * settings.crops, 0.0
     for first in progress(range(0, count, settings.batch)):
-        samples = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), TEST_EPOCH)
+        samples = make_batch(pictures, settings, list(range(first, min(first + settings.batch, count))), TEST_EPOCH)
         if distance is not None:
             samples = dataclasses.replace(samples, distance=torch.full_like(samples.distance, distance))
         if place is not None:
@@ -420,9 +420,9 @@ def _filtered_error(camera: Camera, batch: Batch, filters: Tensor) -> Tensor:
     """Σ |filtered - picture| of every sample after linear filters (C, rows, columns), (B,)."""
     batch = batch.to(camera.fields.device)
     image = camera.image(batch.picture, batch.distance, batch.field, batch.errors, points=batch.points)
-    recorded = camera.recorded(image, batch.points, batch.index, batch.seed)
+    captured = camera.demosaiced(image, batch.points, batch.index, batch.seed)
     apply = restore_jointly if filters.dim() == 4 else restore
-    restored = apply(recorded, filters.to(torch.complex64), boundary="taper")
+    restored = apply(captured, filters.to(torch.complex64), boundary="taper")
     return (restored - camera.target(batch.picture)).abs().mean(-3).sum((-2, -1))
 
 
@@ -441,7 +441,7 @@ def errors_as_built(
     progress: wraps the numbers of the cameras, for a bar.
     """
     count, pixels = len(pictures) * settings.crops, settings.patch**2
-    samples = batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
+    samples = make_batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
     if camera.tolerances is None:
         raise ValueError("errors as built of a camera without tolerances: give as_built, grade or limits")
     drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_FIRST_TEST_TRIAL), []
@@ -520,7 +520,7 @@ def run_model(
     joint = run(STEPS[0])
     if (folder / "outcome.json").exists():
         return
-    trained = camera(lens, settings).to(device)
+    trained = initial_camera(lens, settings).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
     is_second_order = settings.optimizer == "lm"
     if (is_second_order or settings.start in ("spectral", GAUSSIAN)) and not joint.checkpoint.exists():
@@ -639,7 +639,7 @@ def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spect
     """Move the lens of a camera to an optimum of the closed form: by steps of second order for the optimizer "lm", else
     to the optimum named by `start`: of the PSF model of the experiment, or of the Gaussian model."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
-    first = camera(trained.variables.lens, dataclasses.replace(settings, model=model))
+    first = initial_camera(trained.variables.lens, dataclasses.replace(settings, model=model))
     distances = even_distances(first, spread=settings.spread)
     if settings.optimizer == "lm":
         course = closed_form_from_spots(first, spectrum, distances=distances)
@@ -651,7 +651,7 @@ def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spect
 
 def closed_form(lens: Lens, settings: CodesignSettings, spectrum: Tensor) -> Optimum:
     """The optimum of the model of the settings. spectrum: `patch_spectrum` of the pictures."""
-    optimised = camera(lens, settings)
+    optimised = initial_camera(lens, settings)
     if settings.start == GAUSSIAN:
         to_closed_form(optimised, settings, spectrum)
     distances = even_distances(optimised, spread=settings.spread)

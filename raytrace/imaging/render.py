@@ -149,8 +149,8 @@ class ImageFormation:
         background = None if background is None else checked_picture(background, self.sensor, self.sampling)
         if depth is None and len(self.planes) > 1:
             raise ValueError(
-                f"kernels exist for {len(self.planes)} object distances: give `depth`, the distance (H, W) mm of each "
-                "pixel"
+                f"kernels exist for {len(self.planes)} object distances: give {option('depth')}, "
+                "the distance (H, W) mm of every pixel"
             )
         depth = None if depth is None else checked_depth(depth, picture)
 

@@ -40,7 +40,8 @@ _NOISE, _PATCH = 4, 5  # last numbers of keys; `pictures` has those below
 class Sensor:
     """A sensor of square pixels.
 
-    size: (width, height) mm; pixels: (columns, rows); offset: of its centre from the optical axis, (x, y) mm.
+    size: (width, height) mm, pitch times `pixels`; pixels: (columns, rows); offset: of its centre from the optical
+        axis, (x, y) mm.
     response: None or "grey", one channel; "rgb", three Gaussians (`spectral_response.GAUSSIANS`); a table
         {"wavelengths": (N,) µm, "sensitivities": (C, N)}, linear between its wavelengths and 0 outside; the path of a
         CSV file with the header wavelength_nm (or wavelength_um), r, g, b; "Nikon 5100 (NPL)" or "Sigma SDMerill

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.camera import Camera
+from raytrace.imaging.camera_filters import DepthInvariantFilter, LinearFilter, TowardsMeasurement
 from raytrace.imaging.closed_form import camera_error
-from raytrace.imaging.filters import DepthInvariantFilter, LinearFilter, TowardsMeasurement
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.restoration import restore

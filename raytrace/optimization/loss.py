@@ -1,4 +1,4 @@
-"""A loss of a lens: spots first, then the loss by lifted least squares, restarts, and a check by denser rays."""
+"""Minimisation of a loss: spots or other rows first, lifted least squares, restarts, and a check with denser rays."""
 
 import dataclasses
 import time
@@ -18,7 +18,7 @@ from raytrace.optimization.quantities import Quantity, of_configurations
 from raytrace.system.lens import Lens
 from raytrace.words import option
 
-_MOVED = 0.02  # relative change of a loss by denser rays, above which the descent continues
+_DENSER_CHANGE = 0.02  # relative change of a loss by denser rays, above which the descent continues
 _ROUNDS = 3  # of denser rays
 _UNLIMITED = 300  # cycles of a descent without other limits
 _FIRST = 100  # cycles of the rows that are minimised first
@@ -29,7 +29,7 @@ Watch: TypeAlias = Callable[[Cycle, np.ndarray], object]
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """A function () of a lens, or of a quantity of it at object distances (D,), in all its configurations.
+    """A scalar loss: a function of a lens, or of a quantity of it at object distances (D,) mm, in all configurations.
 
     check_rings: of the rays by which an end is checked, by default twice as many as those of the quantity.
     """
@@ -54,8 +54,8 @@ class Loss:
             return cls(function, quantity, check_rings=check_rings)
         if quantity is None:
             raise NoProblem(
-                f"{option('object_distances')} goes with a quantity, as {option('of', 'points')}: a function of the "
-                "lens moves the object itself, by lens.at(object_distance=…)"
+                f"{option('object_distances')} goes with a quantity, {option('of')} points, otf or kernels: a function "
+                "of the lens uses lens.at(object_distance=…)"
             )
         distances = torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1)
         return cls(function, quantity, distances, check_rings)
@@ -66,7 +66,7 @@ class Loss:
         return self.function(of_configurations(self.quantity, lens, self.object_distances))
 
     def denser(self) -> "Loss | None":
-        """The loss of the same quantity by more rays; None of a function of the lens itself, which has its own."""
+        """The loss of the same quantity by more rays; None for a function of the lens, whose rays are unknown."""
         if self.quantity is None:
             return None
         return dataclasses.replace(self, quantity=self.quantity.denser(self.check_rings), check_rings=None)
@@ -74,11 +74,13 @@ class Loss:
 
 @value
 class LossReport:
-    """The way of a loss: at the start, where the rows end that were minimised first, at the end of every descent (from
-    there, then from displaced lenses), and of the end by the rays of the descent and by denser ones.
+    """The loss by stage: start, the initial lens; first, after the rows that are minimised first (pre-optimisation);
+    ends, after each descent, the first from there, the others from displaced lenses; end, of the final lens with the
+    rays of the descent; checked, with denser rays.
 
-    first: nan where rays of the loss fail there, and the descent begins at the start; has_first: whether rows were
-    minimised first; refined: descents with more rays, because a check had moved the loss by more than 2 %.
+    first: nan where rays that the loss needs fail there: the descent then begins at the initial lens; has_first:
+    whether rows were minimised first; refined: descents with more rays, because a check changed the loss by more than
+    2 %.
     """
 
     start: float
@@ -90,26 +92,29 @@ class LossReport:
     has_first: bool = False
 
     def stages(self) -> list[tuple[str, float]]:
-        """The loss by stage of the way, in words; without those that have none."""
-        listed = [("at the start", self.start), ("at the best spots", self.first)]
+        """(stage, loss) of the stages with a finite loss."""
+        listed = [("at the start", self.start), ("after pre-optimisation", self.first)]
         listed += [("after the descent", end) for end in self.ends[:1]]
         listed += [("from a displaced lens", end) for end in self.ends[1:]]
         listed += [("with more rays", self.end)] if self.refined else []
         return [stage for stage in [*listed, ("by denser rays", self.checked)] if np.isfinite(stage[1])]
 
     def lines(self) -> list[str]:
-        """The way in a line, and what should be known of it."""
+        """One line with the loss of every stage, then warnings."""
         lines = ["loss " + ", ".join(f"{number:.6g} {name}" for name, number in self.stages())]
         if self.has_first and not np.isfinite(self.first):
-            lines.append("rays of the loss fail at the best spots: the descent began at the start")
-        if np.isfinite(self.checked) and abs(self.checked - self.end) > _MOVED * abs(self.checked):
-            lines.append("denser rays move the loss by more than 2 %: allow more cycles, or take a finer quantity")
+            lines.append("rays that the loss needs fail after pre-optimisation: the descent began at the start")
+        if np.isfinite(self.checked) and abs(self.checked - self.end) > _DENSER_CHANGE * abs(self.checked):
+            lines.append(
+                f"denser rays change the loss by more than 2 %: raise {option('cycles')}, or sample "
+                "more densely, as by of=Points(rings=16)"
+            )
         return lines
 
 
 @dataclasses.dataclass(frozen=True)
 class LossDescent:
-    """The variables (n,) at the lowest loss, its cycles, the reason of its end and the way there."""
+    """Variables (n,) at the lowest loss, history of the cycles, reason of the end, and the loss by stage."""
 
     x: np.ndarray
     history: tuple[Cycle, ...]
@@ -120,7 +125,7 @@ class LossDescent:
 
 
 class LossDescents:
-    """The descents of a loss over the variables of a problem, whose rows of rays are the metric, with its conditions.
+    """Descents of a loss under the conditions of a problem, whose rows of rays define the metric of the steps.
 
     evaluated: earlier evaluations, as of `FunctionMerit`; those by denser rays are not repeated.
     """
@@ -139,26 +144,27 @@ class LossDescents:
         self.lower, self.upper, self.typical = lower, upper, typical
         self.function = FunctionMerit(problem.model, loss, evaluated)
         self.history: list[Cycle] = []
-        self.most, self.until = 0, np.inf
+        self.cycle_limit, self.deadline = 0, np.inf
 
     def run(
         self, start: np.ndarray, *, first: bool, restarts: int, cycles: int | None, until: float, watch: Watch
     ) -> LossDescent:
-        """The descents of a run, from the start on.
+        """The descents of a run.
 
         first: whether the rows are minimised first; restarts: descents from displaced lenses; cycles: of the descents
         of the loss together, by default 300 each. Raises NoProblem.
         """
-        self.most, self.until = _UNLIMITED * (1 + restarts) if cycles is None else cycles, until
-        before, x, at_first, taken = self.function(start)[0], start, np.nan, 0
+        self.cycle_limit, self.deadline = _UNLIMITED * (1 + restarts) if cycles is None else cycles, until
+        initial_loss, x, pre_optimised_loss, cycles_used = self.function(start)[0], start, np.nan, 0
         if first:
-            at_rows, taken = self._at_best_rows(start)
-            at_first = self.function(at_rows)[0]
-            x = at_rows if np.isfinite(at_first) else start
+            pre_optimised, cycles_used = self._pre_optimised(start)
+            pre_optimised_loss = self.function(pre_optimised)[0]
+            x = pre_optimised if np.isfinite(pre_optimised_loss) else start
         if not np.isfinite(self.function(x)[0]):
-            where = "the start and at the best spots" if first else "the start"
+            where = "the start and after pre-optimisation" if first else "the start"
             raise NoProblem(
-                f"the loss is {self.function(x)[0]:g} at {where}: rays of it fail, and nothing is to follow"
+                f"the loss is {self.function(x)[0]:g} at {where}: rays that it needs fail, and it has no derivative; "
+                "reduce the fields or the aperture, or start from another lens"
             )
         best = self._descend(self.function, x, watch)
         random, ends = np.random.default_rng(0), [_loss(best)]
@@ -172,8 +178,8 @@ class LossDescents:
                 ends.append(_loss(descent))
                 best = descent if descent.state.is_better(best.state) else best
         best, checked, refined, evaluations = self._checked(best, watch)
-        report = LossReport(before, at_first, tuple(ends), _loss(best), checked, refined, first)
-        cycles, evaluations = taken + len(self.history), evaluations + self.function.evaluations
+        report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), _loss(best), checked, refined, first)
+        cycles, evaluations = cycles_used + len(self.history), evaluations + self.function.evaluations
         return LossDescent(best.state.x, tuple(self.history), best.stopped, cycles, evaluations, report)
 
     def _checked(self, best: Descent, watch: Watch) -> tuple[Descent, float, int, int]:
@@ -183,7 +189,7 @@ class LossDescents:
         while (denser := loss.denser()) is not None:
             function, loss = FunctionMerit(self.problem.model, denser), denser
             checked = function(best.state.x)[0]
-            is_same = abs(checked - _loss(best)) <= _MOVED * abs(checked)
+            is_same = abs(checked - _loss(best)) <= _DENSER_CHANGE * abs(checked)
             if is_same or self._is_over(best) or refined == _ROUNDS:
                 break
             best, refined = self._descend(function, best.state.x, watch), refined + 1
@@ -192,11 +198,11 @@ class LossDescents:
 
     def _is_over(self, descent: Descent) -> bool:
         is_stopped = descent.stopped in ("seconds", "interrupted")
-        return is_stopped or len(self.history) >= self.most or time.monotonic() > self.until
+        return is_stopped or len(self.history) >= self.cycle_limit or time.monotonic() > self.deadline
 
-    def _at_best_rows(self, start: np.ndarray) -> tuple[np.ndarray, int]:
+    def _pre_optimised(self, start: np.ndarray) -> tuple[np.ndarray, int]:
         """Variables at the minimum of the rows, and cycles."""
-        lower, upper, typical, until = self.lower, self.upper, self.typical, self.until
+        lower, upper, typical, until = self.lower, self.upper, self.typical, self.deadline
         opening = opened(self.problem, start, lower=lower, upper=upper, typical=typical, until=until)
         descent = least_squares(
             self.problem.state, opening.x, lower=lower, upper=upper, typical=typical, cycles=_FIRST, until=until
@@ -209,14 +215,14 @@ class LossDescents:
     def _descend(self, function: FunctionMerit, x: np.ndarray, watch: Watch) -> Descent:
         offset = len(self.history)
 
-        def each(cycle: Cycle, start: CycleStart) -> None:
+        def record_cycle(cycle: Cycle, start: CycleStart) -> None:
             cycle = dataclasses.replace(cycle, number=cycle.number + offset, evaluations=function.evaluations)
             self.history.append(cycle)
             watch(cycle, start.x)
 
         return descend(
-            self._lifted(function), x, lower=self.lower, upper=self.upper, cycles=self.most - offset, until=self.until,
-            watch=each,
+            self._lifted(function), x, lower=self.lower, upper=self.upper, cycles=self.cycle_limit - offset,
+            until=self.deadline, watch=record_cycle,
         )  # fmt: skip
 
 

@@ -154,7 +154,7 @@ def _scale_merit(axes: "Axes", merit: np.ndarray) -> None:
 
 
 def _draw_way(axes: "Axes", way: LossReport) -> None:
-    """The loss at the start, at the best spots, at the end of each descent, and by denser rays."""
+    """The loss at the start, after pre-optimisation, at the end of each descent, and by denser rays."""
     bars = way.stages()
     places = np.arange(len(bars))
     values = [number for _, number in bars]

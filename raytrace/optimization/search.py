@@ -378,8 +378,9 @@ def search(
     until it is gone, to lenses with one element less (`removal.py`). kind: "phone", a curriculum from plates of plastic
     to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its focal
     length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
-    as_built: `AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of the merit
-    function alone, in the order of the merit with this term; of each lens with the tolerances of its own surfaces.
+    as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of
+    the merit function alone, in the order of the merit with this term; of each lens with the tolerances of its own
+    surfaces.
     loss, of, object_distances: as for `optimize`; the eight best minima are followed to minima of the loss, between the
     same bounds and under the same conditions, and these are the result, in its order; merit and spots are those there.
     folder: keeps the minima as lens files, a table and figures, and the journal: called again the search resumes, with
