@@ -41,10 +41,11 @@ For a phase element without a lens, pictures may be periodic:
 """
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Any, Generic, Literal, Self, TypeVar, get_args
+from typing import Any, Generic, Literal, Self, TypeVar, cast, get_args
 
 import numpy as np
 import torch
@@ -73,7 +74,7 @@ from raytrace.imaging.render import Rendering, element_in_stop, illumination_at,
 from raytrace.imaging.restoration import restore
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
-from raytrace.maths.numerics import as_tensor, uncompiled
+from raytrace.maths.numerics import as_tensor
 from raytrace.maths.result import plain
 from raytrace.psf_models import MODELS, NotConverged, model_name, model_of, name_of
 from raytrace.system.identity import alike
@@ -91,10 +92,26 @@ from raytrace.words import calling_level, former_name, named_value
 
 #: The variables of a camera: of a lens, or of a phase element without one.
 V = TypeVar("V", bound=Variables | PhaseVariables)
+F = TypeVar("F", bound=Callable[..., Any])
 
 _NEAREST = 0.01  # fraction of the nearest object distance of a camera; smaller distances indicate a wrong unit
 _OUTSIDE = 0.1  # of the light outside the window, which kernels of sum 1 hide
 _LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
+
+
+def uncompiled(function: F) -> F:
+    """A function that `torch.compile` does not enter: a graph ends before it, and the next one begins behind it.
+
+    `torch.compiler.disable` alone imports the compiler, which takes seconds.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():
+            return torch.compiler.disable(function)(*arguments, **options)
+        return function(*arguments, **options)
+
+    return cast(F, call)
 
 
 class Camera(nn.Module, Generic[V]):

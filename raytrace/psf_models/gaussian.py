@@ -554,8 +554,8 @@ def _unfold(position: Tensor, order: int, fold: str) -> Tensor:
 def _ray_map(order: int) -> np.ndarray:
     """Matrix (4096, P) from values on the rings to Sobol points: a fit of r^n cos mθ, r^n sin mθ, m ≤ n < 2·order."""
     arms = round_arms(order)
-    points, weights = (t.numpy() for t in gauss_rings(order, arms, device="cpu"))
-    fine = sobol(_MAP_POINTS, device="cpu")[0].numpy()
+    points, weights = (t.numpy() for t in gauss_rings(order, arms, device=torch.device("cpu")))
+    fine = sobol(_MAP_POINTS, device=torch.device("cpu"))[0].numpy()
 
     def basis(p: np.ndarray) -> np.ndarray:
         r, angle = np.hypot(*p), np.arctan2(p[1], p[0])

@@ -225,7 +225,7 @@ def _jacobian(directions: Tensor, pupil: Tensor) -> Tensor:
 def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Matrix (J, T) from Zernike coefficients to those of x^i y^j, and the exponents i and j (T,)."""
     i, j = np.array([(n - k, k) for n in range(_DEGREE + 1) for k in range(n + 1)]).T
-    points, _ = gauss_rings(2 * _DEGREE, 4 * _DEGREE, device="cpu")
+    points, _ = gauss_rings(2 * _DEGREE, 4 * _DEGREE, device=torch.device("cpu"))
     x, y = points.numpy()[:, :, None]
     values = zernike.polynomials(_ORDERS, *points).numpy()
     return np.linalg.lstsq(x**i * y**j, values.T, rcond=None)[0].T, i, j
