@@ -47,6 +47,8 @@ class Tracer:
 
     has_gradient = True
 
+    device = "cpu"
+
     def __init__(self, lens: Lens, dtype: torch.dtype, *, with_path: bool = False, device: str = "cpu"):
         self.name = "raytrace" if device == "cpu" else f"raytrace, {device}"
         self.dtype, self.with_path, self.device = dtype, with_path, device
