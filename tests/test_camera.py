@@ -572,6 +572,29 @@ def test_one_distance_is_that_of_all_places():
         assert torch.equal(own(pictures, 2e4, **places), own(pictures, [2e4] * 2, **places))
 
 
+@pytest.mark.slow
+def test_a_compiled_camera_has_the_same_images_and_derivatives():
+    """The compiler sees blur and network; kernels, checks and noise run outside its graphs."""
+    lens, graphs = read_lens("cooke_triplet").at(wavelengths=[0.55]), []
+    network = RedNet(RedNetShape(2, 2))
+    own = Camera(Variables(lens, "sensor"), network, sensor=NOISY, fields=[0], pixels=7, model=Gaussian(order=3))
+
+    def counted(graph, inputs):
+        graphs.append([str(node.target) for node in graph.graph.nodes])
+        return graph.forward
+
+    def slope(camera):
+        image = camera(torch.ones(2, 1, 16, 16), [2e4, 3e4], index=[0, 1])
+        return image.detach(), torch.autograd.grad(image.square().sum(), own.variables.sensor)[0]
+
+    compiled = torch.compile(own, backend=counted)
+    assert all(map(torch.equal, slope(compiled), slope(own)))
+    count = len(graphs)
+    assert all(map(torch.equal, slope(compiled), slope(own)))
+    assert len(graphs) == count <= 5
+    assert any("conv2d" in target for graph in graphs for target in graph)
+
+
 @pytest.mark.parametrize("model", [Gaussian(order=3), DRT(order=1)])
 def test_pictures_on_the_processor_stay_there_under_another_default_device(model):
     lens = read_lens("cooke_triplet").at(wavelengths=[0.48, 0.55, 0.65])

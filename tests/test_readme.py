@@ -15,9 +15,12 @@ OVERVIEW = (ROOT / "docs" / "reference" / "overview.md").read_text(encoding="utf
 #: Pages whose Python runs, each in one namespace of its own; `lens` and `torch` are those of the README's example.
 PYTHON = [
     ROOT / "README.md",
+    ROOT / "docs" / "index.md",
     *(
         ROOT / "docs" / "reference" / f"{name}.md"
-        for name in ("lens_files", "rays", "psf", "learning", "rendering", "merit", "opticstudio")
+        for name in (
+            *("lens_files", "rays", "psf", "learning", "rendering", "jacobian", "tolerances", "merit", "opticstudio"),
+        )
     ),
 ]
 #: Pages of every public name with an example each.
@@ -107,14 +110,10 @@ def test_examples_run(line, tmp_path, monkeypatch, capsys):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("page", quick_and_slow(PYTHON, STEM), ids=STEM)
 def test_python_runs(page, tmp_path, monkeypatch, capsys):
-    import torch
-
-    import raytrace as rt
-
+    """The blocks of a page, one after another, without other names."""
     (tmp_path / "lenses").symlink_to(ROOT / "lenses")
     monkeypatch.chdir(tmp_path)
-    lens = rt.read_lens("double_gauss").at(object_distance=25e3)
-    names = {"torch": torch, "rt": rt, "lens": lens}
+    names: dict = {}
     blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
     assert blocks
     for block in blocks:
@@ -124,17 +123,9 @@ def test_python_runs(page, tmp_path, monkeypatch, capsys):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("page", quick_and_slow(API, STEM), ids=STEM)
 def test_examples_of_public_names_run(page, tmp_path, monkeypatch):
-    import dataclasses
-    import os
-    import warnings
-
-    import torch
-
-    import raytrace as rt
-
+    """The blocks of a page, one after another, without other names."""
     monkeypatch.chdir(tmp_path)
-    names = {"dataclasses": dataclasses, "os": os, "warnings": warnings, "torch": torch, "rt": rt}
-    names |= {"lens": rt.read_lens("double_gauss"), "triplet": rt.read_lens("cooke_triplet")}
+    names: dict = {}
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
         exec(compile(block, page.name, "exec"), names)
 

@@ -73,7 +73,7 @@ from raytrace.imaging.render import Rendering, element_in_stop, illumination_at,
 from raytrace.imaging.restoration import restore
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.variables import KEY, OtherLens, PhaseVariables, Variables, converted, decoded_text, encoded_text
-from raytrace.maths.numerics import as_tensor
+from raytrace.maths.numerics import as_tensor, uncompiled
 from raytrace.maths.result import plain
 from raytrace.psf_models import MODELS, NotConverged, model_name, model_of, name_of
 from raytrace.system.identity import alike
@@ -422,6 +422,7 @@ class Camera(nn.Module, Generic[V]):
         arguments = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
         return ElementKernels(lens, elements, *arguments)
 
+    @uncompiled
     def kernels(
         self,
         object_distances: Tensor | Sequence[float] | float,
@@ -587,6 +588,7 @@ class Camera(nn.Module, Generic[V]):
                 f"a point at ({x:g}, {y:g}) mm is beyond the edges of the sensor of {width:g} x {height:g} mm{advice}"
             )
 
+    @uncompiled
     def _distances(self, object_distances: Tensor | Sequence[float] | float) -> Tensor:
         """Object distances (B,) mm. Raises ValueError for none and for other shapes."""
         distances = torch.as_tensor(object_distances, dtype=self.fields.dtype, device=self.fields.device)
@@ -634,6 +636,7 @@ class Camera(nn.Module, Generic[V]):
         """H (..., rows, columns) of kernels (..., h, w) of the camera on periodic images of this size, with haze."""
         return transfer_functions(kernels, size, haze=self.normalise == "haze")
 
+    @uncompiled
     def _of_channels(self, picture: Tensor, distances: Tensor) -> Tensor:
         """Light (B, C, H, W) of pictures of the channels of the sensor, at object distances (B,). Raises ValueError."""
         light, channels = self._light(picture), self.sensor.channels
@@ -707,6 +710,7 @@ class Camera(nn.Module, Generic[V]):
         image = self.image(picture, object_distances, field, errors, points=points)
         return self.restore(self.demosaiced(image, points, index, seed))
 
+    @uncompiled
     def demosaiced(
         self,
         image: Tensor,

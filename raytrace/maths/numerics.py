@@ -23,7 +23,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass as value
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
 import torch
@@ -45,6 +45,8 @@ class Dataclass(Protocol):
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
 
+F = TypeVar("F", bound=Callable[..., Any])
+
 #: A context in which torch's functions take tensors of a subclass as plain ones.
 plain_functions = torch._C.DisableTorchFunctionSubclass
 
@@ -65,6 +67,21 @@ def as_tensor(numbers: Any, **like: Any) -> Tensor:
     like: dtype of other numbers.
     """
     return numbers if isinstance(numbers, Tensor) else torch.as_tensor(numbers, device="cpu", **like)
+
+
+def uncompiled(function: F) -> F:
+    """A function that `torch.compile` does not enter: a graph ends before it, and the next one begins behind it.
+
+    `torch.compiler.disable` alone imports the compiler, which takes seconds.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():
+            return torch.compiler.disable(function)(*arguments, **options)
+        return function(*arguments, **options)
+
+    return cast(F, call)
 
 
 def varies(number: object) -> bool:
