@@ -6,6 +6,8 @@ The code of docs/index.md is run as it stands there; here its results are drawn.
 import re
 from pathlib import Path
 
+from PIL import Image
+
 import raytrace as rt
 from raytrace.analysis.layout import draw_layout
 from raytrace.plotting.style import new_figure, styled
@@ -35,7 +37,8 @@ def picture(lens, scene, psfs, images, restored):
     inside = (slice(None), *2 * (slice(MARGIN, -MARGIN),))
     panels = right.subplots(3, len(psfs))
     for column, psf, image, estimate, angle in zip(panels.T, psfs, images, restored, fields[1].tolist(), strict=True):
-        show(column[0], (psf / psf.amax((-2, -1), keepdim=True)).clamp_min(0).sqrt(), f"PSF at {angle:g}°")
+        window = psf[..., 8:-8, 8:-8].clamp_min(0)
+        show(column[0], (window / window.amax((-2, -1), keepdim=True)).sqrt(), f"PSF at {angle:g}°")
         for panel, one, name in ((column[1], image, "image"), (column[2], estimate, "restored")):
             ratio = float(rt.imaging.psnr((one - scene)[inside].square().mean()))
             show(panel, one[inside], f"{name}, {ratio:.1f} dB")
@@ -51,4 +54,7 @@ def show(panel, colours, title: str) -> None:
 if __name__ == "__main__":
     names = results()
     drawn = picture(*(names[name] for name in ("lens", "scene", "psfs", "images", "restored")))
-    drawn.savefig(DOCS / "front.png", dpi=110)
+    drawn.savefig(DOCS / "front.png", dpi=100)
+    with Image.open(DOCS / "front.png") as full:
+        reduced = full.convert("RGB").quantize(192)
+    reduced.save(DOCS / "front.png", optimize=True)

@@ -159,7 +159,6 @@ class Report(Result):
             *(picture(f"{self.folder}/{name}", CAPTIONS[name]) for name in self.figures),
             "## The best linear filter and training",
             _closed_form(self),
-            "## Time of a step",
             _times(self),
         ]
 
@@ -280,10 +279,11 @@ def _closed_form(report: Report) -> str:
 
 
 def _times(report: Report) -> str:
-    lines = [(NAMES[t.model], *(f"{ms:.1f}" for ms in (t.psf, t.image, t.network))) for t in report.times]
     about = ", ".join(f"{key} {value}" for key, value in report.machine.items())
-    table = grid(("model", "PSFs (ms)", "image (ms)", "network (ms)"), lines)
-    return f"{table}\n\nA batch, forward and backward, median of several, the models in turns: {about}."
+    return (
+        "Times of PSFs, image and network in a step, forward and backward, median of several, the models in turns: "
+        f"[times.csv]({report.folder}/times.csv); {about}."
+    )
 
 
 def _spread(summary: Summary, column: str, digits: int) -> str:

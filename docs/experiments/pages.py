@@ -64,7 +64,7 @@ def yes(fact: bool | None, none: str = "–") -> str:
 
 def picture(place: str, caption: str) -> str:
     """A figure with its caption below it; the caption up to its first punctuation mark in place of the figure."""
-    return f"![{re.split('[,;:.]', caption)[0]}]({place})\n\n*{caption}*"
+    return f"![{re.split(r'[,;:.](?: |$)', caption)[0]}]({place})\n\n*{caption}*"
 
 
 def shown(value: float, digits: int) -> str:

@@ -72,10 +72,10 @@ class Curriculum:
 
     def conditions(self, length: float, hold: Sequence[str]) -> list[str]:
         """The conditions of `hold`, and those of the curriculum of other quantities."""
-        words, named = [*hold], {split_constraint(word)[0] for word in hold}
+        words, quantities = [*hold], {split_constraint(word)[0] for word in hold}
         for limit, number in self.holds.items():
             name, relation = limit[:-2], limit[-2:]
-            if name not in named:
+            if name not in quantities:
                 words.append(f"{name}{relation}{number if name.endswith('angle') else number * length:.6g}")
         return words
 
