@@ -33,7 +33,11 @@ def _afford(count: float, rule: str, size: str) -> None:
 
 
 def gauss_rings(
-    rings: int = 6, arms: int | None = None, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    rings: int = 6,
+    arms: int | None = None,
+    *,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Gaussian quadrature in r², equal angles: exact for polynomials up to degree 4·rings - 2 (Forbes, JOSA A 5, 1988).
 
@@ -74,7 +78,7 @@ def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hexapolar(
-    rings: float = 6, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    rings: float = 6, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> tuple[Tensor, Tensor]:
     """The centre and `rings` rings of 6, 12, 18, … points at radii j/rings; each ring carries its share of the area.
 
@@ -93,7 +97,7 @@ def hexapolar(
 
 
 def equal_rings(
-    rings: int = 8, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    rings: int = 8, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> tuple[Tensor, Tensor]:
     """Rings of 2·rings points (at least 8) at the mean r² of rings of equal area: all points share the light equally.
 
@@ -109,7 +113,7 @@ def equal_rings(
 
 
 def square(
-    across: int = 16, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    across: int = 16, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> tuple[Tensor, Tensor]:
     """Cell centres of an across × across grid over [-1, 1]² that lie inside the disc, equal weights."""
     _at_least_one("square", across=across)
@@ -121,7 +125,7 @@ def square(
 
 
 def sobol(
-    count: int = 256, *, seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    count: int = 256, *, seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> tuple[Tensor, Tensor]:
     """Scrambled Sobol points mapped to the disc by r = √u, equal weights; the same points for the same seed."""
     _at_least_one("sobol", count=count)
@@ -136,7 +140,7 @@ def random(
     generator: torch.Generator | None = None,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
-    device: torch.device | None = None,
+    device: torch.device | str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Independent uniform points of the disc, equal weights; drawn from `generator`, or from a new one of `seed`."""
     _at_least_one("random", count=count)
@@ -146,7 +150,7 @@ def random(
 
 
 def fan(
-    count: int = 21, axis: str = "y", *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    count: int = 21, axis: str = "y", *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
 ) -> tuple[Tensor, Tensor]:
     """`count` points from -1 to 1 along x or y, equal weights: for drawing, not for integrating."""
     _at_least_one("fan", count=count)
@@ -163,18 +167,18 @@ def with_rim(points: Tensor, weights: Tensor, arms: int = 72) -> tuple[Tensor, T
     return torch.cat([points, rim], 1), torch.cat([weights, weights.new_zeros(arms)])
 
 
-def _disc(uniform: Tensor, dtype: torch.dtype, device: torch.device | None) -> tuple[Tensor, Tensor]:
+def _disc(uniform: Tensor, dtype: torch.dtype, device: torch.device | str | None) -> tuple[Tensor, Tensor]:
     radius, angle = torch.sqrt(uniform[:, 0]), 2 * math.pi * uniform[:, 1]
     return _equal(torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)]).numpy(), dtype, device)
 
 
-def _equal(points: np.ndarray, dtype: torch.dtype, device: torch.device | None) -> tuple[Tensor, Tensor]:
+def _equal(points: np.ndarray, dtype: torch.dtype, device: torch.device | str | None) -> tuple[Tensor, Tensor]:
     count = points.shape[1]
     return _tensors(points, np.full(count, 1.0 / count), dtype, device)
 
 
 def _tensors(
-    points: np.ndarray, weights: np.ndarray, dtype: torch.dtype, device: torch.device | None
+    points: np.ndarray, weights: np.ndarray, dtype: torch.dtype, device: torch.device | str | None
 ) -> tuple[Tensor, Tensor]:
     return torch.as_tensor(points, dtype=dtype, device=device), torch.as_tensor(weights, dtype=dtype, device=device)
 
@@ -196,7 +200,7 @@ def sampled(
     points: int | None = None,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
-    device: torch.device | None = None,
+    device: torch.device | str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Points (2, P) and weights (P,) of a rule of SAMPLINGS.
 
