@@ -345,7 +345,10 @@ NO_OPTION = {
     "window": "the kernels of a picture of the whole field, in Python",
 }
 #: Parameters of one command's function without an option: a loss is a function of Python.
-OF_PYTHON = {"optimize": {"loss", "of", "object_distances", "first", "restarts"}}
+OF_PYTHON = {
+    "optimize": {"loss", "of", "object_distances", "first", "restarts", "check_rings"},
+    "search": {"loss", "of", "object_distances"},
+}
 #: Functions whose parameters are options of a command, by a parameter of its public function that holds them.
 PARTS = {
     "merit": (merit_of_options, DefaultMerit, Merit.of),

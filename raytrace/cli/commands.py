@@ -311,7 +311,7 @@ COMMANDS = (
             Option("delete", count, "SURFACE", "instead of starts: remove each element, or those of these first "
                 "surfaces, flattened and thinned while the rest follows", nargs="*"),
             "seconds",
-            Option("kind", None, "KIND", "phone: from plates of plastic to a wide and fast lens of aspheres, in steps",
+            Option("kind", None, None, "phone: from plates of plastic to a wide and fast lens of aspheres, in steps",
                 choices=("phone",)),
             row("seed", "of starts and hops"),
         ),
