@@ -47,8 +47,9 @@ _SMALLEST = 1e-6  # of the RMS spot: blur of a step, below which its change of t
 _LEAST = 1e-8  # eigenvalue of B relative to the largest
 _AGAIN = 1e-3  # relative decrease of the loss by a descent after which another one without pairs begins
 _JUMP = 0.4  # of the RMS spot: blur of the displacement of a restart
-#: Options of the solver: the residuals are a model without a second derivative along a step.
-OPTIONS = SolverOptions(bends=False)
+#: Options of the solver: the residuals are a model without a second derivative along a step, and the last per mille of
+#: a loss is worth no further hundred cycles.
+OPTIONS = SolverOptions(bends=False, tolerance=3e-4)
 
 
 @dataclasses.dataclass(frozen=True)
