@@ -258,7 +258,7 @@ def test_wrong_cameras_as_built_are_refused(lens):
         (
             {"center": "centroid", "model": rt.psf_models.Gaussian(rays=torch.zeros(2, 3))},
             ValueError,
-            "pupil points are about the chief ray",
+            "give center chief",
         ),
     ):
         with pytest.raises(error, match=words):

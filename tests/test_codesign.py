@@ -139,7 +139,7 @@ def test_plain_rays_of_drt_are_of_both_steps(lens):
     for model in ("paraxial", "gaussian", "drt"):
         own = initial_camera(lens, dataclasses.replace(few, model=model))
         freeze_lens(own, few)
-        assert torch.equal(own.kernels(z), traced.kernels(z)), model
+        torch.testing.assert_close(own.kernels(z), traced.kernels(z), rtol=0, atol=1e-13)  # with and without a graph
 
 
 def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):

@@ -418,7 +418,7 @@ def test_a_curriculum_refuses_what_it_cannot_begin_with(lens, hold, said):
 
 
 def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
-    with pytest.raises(NoProblem, match="did you mean phone"):
+    with pytest.raises(NoProblem, match="expected phone"):
         rt.search(phone_plates, kind="fone", hold="efl=6")
     with pytest.raises(NoProblem, match="exclude one another"):
         rt.search(phone_plates, kind="phone", insert=True)
@@ -563,7 +563,7 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
         (
             ["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"],
-            "--starts, --insert and --delete exclude one another",
+            "--starts, --insert, --delete and --kind exclude one another",
         ),
         (["--merit", "spot", "--vary", "curvature", "--insert", "3"], "surface 3 is none before the image"),
         (["--merit", "spot", "--vary", "curvature:1", "--insert", "2"], "has a curvature that does not vary"),
