@@ -21,7 +21,7 @@ from raytrace.optimization.between import worse_between
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import DefaultMerit, merit_for
 from raytrace.optimization.opening import opened
-from raytrace.optimization.problem import Condition, NoProblem, conditions_in_unit
+from raytrace.optimization.problem import Condition, NoProblem, conditions_in_unit, typical_of
 from raytrace.optimization.search_tasks import (
     Journal,
     Minimum,
@@ -35,6 +35,8 @@ from raytrace.system.lens import Lens
 from raytrace.words import did_you_mean, option
 
 _FOLLOWED = 2  # minima of the first search
+_HALVINGS = 24  # of steps whose start is far from the lens before
+_LEAP = 100.0  # of the merit: beyond it a start is far
 _REPEATS = 2  # of the last step, where spots are worse between its fields
 _MORE_RINGS = 2
 
@@ -49,6 +51,11 @@ class Step:
     terms: tuple[str, ...] = ()
     rings: int = 3
     cycles: int = 60
+
+    def halfway(self, step: "Step") -> "Step":
+        """A step to the middle of the aperture and the field between this one and another, with its terms."""
+        aperture, field = 0.5 * (self.aperture + step.aperture), 0.5 * (self.field + step.field)
+        return replace(step, aperture=aperture, field=field)
 
 
 @dataclass(frozen=True)
@@ -211,13 +218,20 @@ class Growth:
     ) -> tuple[SearchProblem, Minimum] | None:
         """The lens at the end of the steps from a minimum; None where one of them loses rays.
 
-        The last step is repeated with denser fields and rays while spots are worse between them.
+        A step whose start is far from this lens is taken in halves. The last step is repeated with denser fields and rays
+        while spots are worse between them.
         """
         result, seconds = minimum.result, minimum.seconds
-        waiting, repeats = list(steps), 0
+        waiting, repeats, taken, halvings = list(steps), 0, self.plan.curriculum.steps[0], _HALVINGS
         for number in itertools.count(1):
-            step = waiting.pop(0)
-            task = self.plan.problem(task.model.lens_at(result.x), step)
+            lens, step = task.model.lens_at(result.x), waiting.pop(0)
+            task = self.plan.problem(lens, step)
+            while halvings and self._is_far(task, result.merit):
+                halvings -= 1
+                waiting.insert(0, step)
+                step = taken.halfway(step)
+                task = self.plan.problem(lens, step)
+            taken = step
             key, descent = f"{minimum.task}, step {number}", partial(self._descended, task, step)
             (result,) = self.journal.each([(key, descent)], len(task.model.start))
             seconds += result.seconds
@@ -234,13 +248,21 @@ class Growth:
         end = Minimum(result, minimum.task, seconds, minimum.descents)
         return (task, end) if result.is_valid else None
 
+    @staticmethod
+    def _is_far(task: SearchProblem, merit: float) -> bool:
+        """Whether a step loses rays at its start, or has 100 times the merit of the step before there."""
+        with np.errstate(all="ignore"):
+            state = task.whole.state(np.clip(task.model.start, *task.bounds), False)
+        return bool(state.lost) or not state.is_finite or state.merit > _LEAP * merit
+
     def _descended(self, task: SearchProblem, step: Step) -> TaskResult:
         """The end of a step; rays of the larger beam that fail are brought back first. Raises SearchStopped."""
-        space, started = task.space, time.process_time()
-        x = np.clip(task.model.start, space.lower, space.upper)
-        x = opened(task.whole, x, lower=space.lower, upper=space.upper, until=self.journal.until).x
-        stage = Stage(task.whole, step.cycles, SolverOptions(tolerance=1e-5), space.lower, space.upper)
-        end = descended(x, [stage], self.journal.until)
+        (lower, upper), started = task.bounds, time.process_time()  # the ranges of a search are for its starts
+        x = np.clip(task.model.start, lower, upper)
+        typical, until = typical_of(task.model), self.journal.until
+        x = opened(task.whole, x, lower=lower, upper=upper, typical=typical, until=until).x
+        stage = Stage(task.whole, step.cycles, SolverOptions(tolerance=1e-5), lower, upper, typical)
+        end = descended(x, [stage], until)
         return end._replace(seconds=time.process_time() - started)
 
     def each(self) -> list[tuple[SearchProblem, Minimum]]:

@@ -398,13 +398,14 @@ class SearchProblem:
 
 
 class Stage(NamedTuple):
-    """A descent on a problem between bounds (n,), in at most so many cycles."""
+    """A descent on a problem between bounds (n,), in at most so many cycles; typical: as for `least_squares`."""
 
     problem: Problem
     cycles: int
     options: SolverOptions
     lower: np.ndarray
     upper: np.ndarray
+    typical: np.ndarray | None = None
 
     def moves(self, x: np.ndarray) -> np.ndarray:
         """(n,) which variables are at none of their bounds."""
@@ -424,8 +425,8 @@ def descended(x: np.ndarray, stages: Sequence[Stage], until: float = np.inf) -> 
             if stage.problem.state(x, False).is_finite:
                 with suppress(np.linalg.LinAlgError, RuntimeError):  # numbers overflow
                     end = least_squares(
-                        stage.problem.state, x, lower=stage.lower, upper=stage.upper, options=stage.options,
-                        cycles=stage.cycles, until=until,
+                        stage.problem.state, x, lower=stage.lower, upper=stage.upper, typical=stage.typical,
+                        options=stage.options, cycles=stage.cycles, until=until,
                     )  # fmt: skip
         if end is not None and end.stopped in ("interrupted", "seconds"):
             raise SearchStopped
