@@ -218,8 +218,8 @@ class Growth:
     ) -> tuple[SearchProblem, Minimum] | None:
         """The lens at the end of the steps from a minimum; None where one of them loses rays.
 
-        A step whose start is far from this lens is taken in halves. The last step is repeated with denser fields and rays
-        while spots are worse between them.
+        A step whose start is far from this lens is taken in halves. The last step is repeated with denser fields and
+        rays while spots are worse between them.
         """
         result, seconds = minimum.result, minimum.seconds
         waiting, repeats, taken, halvings = list(steps), 0, self.plan.curriculum.steps[0], _HALVINGS
