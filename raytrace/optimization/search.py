@@ -250,7 +250,7 @@ def searched(
         focal_length=torch.stack(
             [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
         ),
-        spots=torch.stack([spot(lens_of_minimum).whole.rms_radius for lens_of_minimum in lenses]),
+        spots=_spots(lens, lenses),
         between=tensor([max((gap.ratio for gap in between(each)), default=np.nan) for each in lenses]),
         times_reached=torch.tensor([minimum.descents for _, minimum in minima]),
         after=tensor([minimum.seconds for _, minimum in minima]),
@@ -304,6 +304,13 @@ def _as_built(problem: Problem, minimum: Minimum, settings: ExpectationSettings)
     with torch.no_grad():
         spots = [float(q(lens)) ** 0.5 for q in (term.expected, term.nominal)]
     return problem.merit(problem.evaluated(x), x), *spots
+
+
+def _spots(before: Lens, lenses: Sequence[Lens]) -> Tensor:
+    """RMS radii (M, F) in mm, of all wavelengths, at the fields of the lenses, of `before` where they have others."""
+    counts = {len(lens.fields.y) for lens in (before, *lenses)}
+    fields = None if len(counts) == 1 else field_points(None, like=before)
+    return torch.stack([spot(lens, fields=fields).whole.rms_radius for lens in lenses])
 
 
 def _draw(axes: "Axes", result: Searched, k: int) -> None:
