@@ -14,7 +14,7 @@ from problems import SHARED, fields, lens, scalar, semi_diameters, surface, vect
 
 import raytrace as rt
 from raytrace.materials.catalogs import UnknownGlass
-from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
+from raytrace.materials.glass import MIRROR, abbe_number, is_air, model_glass, nd
 from raytrace.optimization.lens_state import Bundle
 from raytrace.optimization.merit import LOST, Evaluation
 from raytrace.optimization.operands.boundaries import BOUNDARIES, SemiDiameters
@@ -24,6 +24,7 @@ from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing import geometry
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -80,7 +81,7 @@ VARY = {
     ),
 }
 OF_RANGES = [name for name in BOUNDARIES if name[:2] in ("MN", "MX")]
-OF_ONE = [name for name in BOUNDARIES if name not in OF_RANGES]
+OF_ONE = [name for name in BOUNDARIES if name not in (*OF_RANGES, "FTGT", "FTLT")]
 
 
 # -- the definitions again ---------------------------------------------------------------------------------------------
@@ -209,7 +210,7 @@ def test_every_row_follows_its_definition(case):
     found = evaluation(model.start)
     for row, computed in zip(rows, found.values, strict=True):
         assert computed == pytest.approx(expected(model.lens, row), rel=1e-9, abs=1e-10), row
-    assert {row.operand for row in rows} == set(BOUNDARIES)
+    assert {row.operand for row in rows} == set(OF_RANGES + OF_ONE)
 
 
 def test_derivatives_of_every_row_are_those_of_finite_differences(case):
@@ -466,3 +467,44 @@ def test_rays_that_are_lost_leave_the_size_to_the_others():
     assert computed.lost[0]
     assert computed.merit == LOST
     assert not computed.jacobian.any()
+
+
+# -- thickness between the axis and the edge
+
+
+def thinnest(found, k):
+    """Least distance in mm of two surfaces at 16 heights up to their common rim, and the sum of those below 0.3 mm."""
+    sizes = np.array(geometry.semi_diameters(found))
+    ends, last = np.arange(len(sizes)), len(sizes) - 1
+    ends[1:last] += 1
+    in_glass = np.array([not is_air(one.glass) for one in found.surfaces])
+    rim = geometry.rims(sizes, ends, in_glass)[k]
+    heights = vector(*(rim * np.arange(1, 17) / 16))
+    front, back = (sag_at(found.surfaces[j], 0 * heights, heights) for j in (k, k + 1))
+    apart = (found.surfaces[k].thickness + back - front).numpy()
+    return apart.min(), np.maximum(0.3 - apart, 0.0).sum()
+
+
+@pytest.mark.parametrize("k", [2, 3, 5, 9, 10, 11])
+def test_a_full_thickness_is_compared_at_all_heights(k):
+    phone = rt.read_lens("phone")
+    row = Row("FTGT", (k, 0), target=0.3, weight=1.0)
+    least, short_of = thinnest(phone, k)
+    value = float(rt.evaluate(phone, merit=[row]).values[0])
+    assert value == pytest.approx(0.3 - short_of, abs=1e-9)
+    largest = rt.evaluate(phone, merit=rt.optimization.Merit((row,), conventions="boundary=largest"))
+    assert float(largest.values[0]) == pytest.approx(min(0.3, least), abs=1e-9)
+
+
+def test_derivatives_of_a_full_thickness_are_differences():
+    phone = rt.read_lens("phone")
+    variables = (Vary(9, "curvature"), Vary(9, "a4"), Vary(10, "a6"), Vary(9, "thickness"))
+    model = DesignVariables(phone, variables)
+    evaluation = Evaluation(model, (Row("FTGT", (9, 0), target=0.3, weight=1.0),))
+    x, step = model.start, 1e-6
+    (sides,) = evaluation(x, derivatives=True).sides
+    violations, slopes = sides[1], sides[2]
+    ends = [[evaluation(x + sign * step * np.eye(4)[k]).sides[0][1] for sign in (1, -1)] for k in range(4)]
+    differences = np.stack([(ahead - back) / (2 * step) for ahead, back in ends], -1)
+    assert len(violations) == 16
+    assert slopes == pytest.approx(differences, rel=1e-4, abs=1e-6)

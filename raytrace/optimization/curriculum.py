@@ -10,16 +10,17 @@ Limits relative to the focal length f that nobody gives are part of a curriculum
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from raytrace.materials.glass import is_air
 from raytrace.optimization.between import worse_between
 from raytrace.optimization.least_squares import SolverOptions
-from raytrace.optimization.merit import DefaultMerit, merit_for
+from raytrace.optimization.merit import Boundaries, DefaultMerit, merit_for
 from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import Condition, NoProblem, conditions_in_unit, typical_of
 from raytrace.optimization.search_tasks import (
@@ -32,6 +33,8 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import bounds_of, constraint_words, design_variables, name_of, split_constraint
 from raytrace.system.lens import Lens
+from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import sensor
 from raytrace.words import did_you_mean, option
 
 _FOLLOWED = 2  # minima of the first search
@@ -166,10 +169,19 @@ class Plan:
             places = ",".join(map(str, curved))
             free = design_variables(seen, [*words, *(f"{term}:{places}" for term in step.terms)])
         function = merit_for(seen, self.curriculum.merit(self.length, step.rings, self.merit))
+        if step.terms:
+            function = replace(function, rows=(*function.rows, *self._full_thicknesses(seen, function.boundaries)))
         hold: list[str | Condition] = [*self.curriculum.conditions(self.length, self.words), *self.others]
         conditions = conditions_in_unit(seen, hold, function.unit)
         ends, limits = bounds_of(free.lens, free.variables, self.bounds), function.boundaries
         return SearchProblem(free, function.rows, conditions, ends, limits.glass, limits.air, function.options)
+
+    @staticmethod
+    def _full_thicknesses(lens: Lens, limits: Boundaries) -> Iterator[Row]:
+        """Rows by which no two surfaces come too near to each other between the axis and the edge, as aspheres may."""
+        for k in range(1, sensor(lens)):
+            least = (limits.air or (0.0, 0.0))[0] if is_air(lens.surfaces[k].glass) else limits.edge or 0.0
+            yield Row("FTGT", (k, 0), target=least, weight=1.0)
 
     def _seen(self, lens: Lens, step: Step) -> Lens:
         """The lens with the aperture and the fields of a step."""

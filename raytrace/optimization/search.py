@@ -68,6 +68,7 @@ from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.compiled import prepare
+from raytrace.tracing.geometry import warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import calling_level, option
@@ -463,6 +464,7 @@ def search(
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
     warn_of_worse([gap for gap in between(result.lens) if gap.is_worse])
+    warn_of_defects(result.lens)
     if folder is not None and not (share and share.rank):
         try:
             result.save(folder)

@@ -105,6 +105,9 @@ SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 #: Offset of the code of a row at the common rim, and the numbers of such a row.
 RIM, AT_RIM = len(SIDES), (0.0, 0.0, 0.0, 1.0)
 
+#: Equidistant heights from the axis to the common rim at which a full thickness is compared; their codes follow 2·RIM.
+ZONES = 16
+
 _EDGE = 1e-4  # of 1 - (1+k) c² s²: from where the root of a conic is continued
 
 
@@ -158,6 +161,8 @@ class Gaps:
             sags_there = self._sag(context, code, every, sizes)
             return sags_there, sags_there[self.end]
         rim = rims(sizes, self.end, ~self.is_air & (self.end > every))
+        if code >= 2 * RIM:
+            rim, code = rim * ((code - 2 * RIM + 1) / ZONES), RIM
         front, back = (self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
         return front, back
 
@@ -252,6 +257,12 @@ def _single(line: Line, planner: Planner) -> list[tuple[int, int]]:
     """The surface of a row, and the side of its edge. Raises BadRow."""
     surface, code = planner.checked(line, line.row.integers[0]), line.row.integers[1]
     return [(surface, (code if 0 <= code < len(SIDES) else 0) + _rim_of(line))]
+
+
+def _zones(line: Line, planner: Planner) -> list[tuple[int, int]]:
+    """The surface of a row, once for every height. Raises BadRow."""
+    surface = planner.checked(line, line.row.integers[0])
+    return [(surface, 2 * RIM + zone) for zone in range(ZONES)]
 
 
 def _rim_of(line: Line) -> int:
@@ -408,7 +419,19 @@ _OF_ONE = (
     ("DM", _DIAMETER, "diameter of surface int1", "", None),
 )
 
+_FULL = Amount(Gaps.edge, 1, "edges")
+
 BOUNDARIES: dict[str, Operand] = {
+    **{
+        f"FT{tail}": Operand(
+            partial(_within, amount=_FULL, chosen=_zones, side=side),
+            f"thickness behind surface int1 at {ZONES} heights up to the common rim, {word} the target",
+            1,
+            f"{_SIGNED}; `boundary` sum: of the violations at all heights, or largest",
+            bounds=relation,
+        )
+        for tail, side, word, relation in (("GT", 1.0, "at least", ">="), ("LT", -1.0, "at most", "<="))
+    },
     **{
         f"{head}{tail}": Operand(
             partial(_within, amount=amount, chosen=chosen, side=side, also=also),
