@@ -426,7 +426,7 @@ def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
 
 @pytest.mark.slow
 def test_from_plates_to_a_phone_lens_that_is_as_sharp_between_its_fields(phone_plates, tmp_path):
-    result = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    result = rt.search(phone_plates, kind="phone", hold="efl=6", starts=2, folder=tmp_path)
     lens = result.lens
     assert result.stopped == "steps"
     data = rt.first_order(lens)
@@ -436,7 +436,7 @@ def test_from_plates_to_a_phone_lens_that_is_as_sharp_between_its_fields(phone_p
     assert float(dense.whole.rms_radius.max()) < 0.004
     assert float(result.between[0]) < 1.5
     assert sum(float(surface.thickness) for surface in lens.surfaces[1:-1]) < 1.35 * 6 + 1e-6
-    again = rt.search(phone_plates, kind="phone", hold="efl=6", starts=1, folder=tmp_path)
+    again = rt.search(phone_plates, kind="phone", hold="efl=6", starts=2, folder=tmp_path)
     assert torch.equal(again.variables, result.variables)
 
 
