@@ -422,6 +422,8 @@ def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
         rt.search(phone_plates, kind="fone", hold="efl=6")
     with pytest.raises(NoProblem, match="exclude one another"):
         rt.search(phone_plates, kind="phone", insert=True)
+    with pytest.raises(NoProblem, match="a merit function of its own"):
+        rt.search(phone_plates, kind="phone", hold="efl=6", merit="wavefront")
 
 
 @pytest.mark.slow

@@ -203,5 +203,5 @@ def _is_of(row: Row, k: int) -> bool:
 
 
 def _rows(rows: Sequence[Row], k: int) -> tuple[Row, ...]:
-    """The rows of the lens without the element."""
+    """The rows of the lens without the element; rows of the element alone are left out."""
     return renumbered([row for row in rows if not _is_of(row, k)], partial(_number, k=k))

@@ -415,6 +415,8 @@ def search(
         )
     plan = None
     if kind is not None:
+        if merit is not None and not isinstance(merit, DefaultMerit):
+            raise NoProblem(f"{option('kind', kind)} has a merit function of its own: leave {option('merit')} out")
         plan = Plan(kind, lens, vary, bounds, hold, merit if isinstance(merit, DefaultMerit) else None)
         task = plan.problem(lens, plan.curriculum.steps[0])
         starts = plan.curriculum.starts if starts is None else starts
