@@ -62,8 +62,8 @@ def between(lens: Lens) -> tuple[Between, ...]:
     """The largest spots halfway between neighbouring fields, halfway between neighbouring wavelengths, and of the whole
     pupil with its rim against the few rays of a default merit function; of every configuration.
 
-    Spots are those of `rt.spot`, RMS about the centroid of all wavelengths of the field. Fields are neighbours in the
-    order of their height.
+    `rt.spot` computes the spots, RMS about the centroid of all wavelengths of the field, mm. Fields are neighbours in
+    the order of their height. Neglected: other places than these halfway points, and light beyond the lens's own band.
     """
     several = len(lens.configurations) > 1
     lenses = [(number if several else 0, detached(each)) for number, each in enumerate(lens.configurations, 1)]
@@ -88,7 +88,8 @@ def _of_lens(lens: Lens, configuration: int) -> Iterator[Between]:
     points = points[:, points.norm(dim=0).argsort()]
     middle = 0.5 * (points[:, :-1] + points[:, 1:])
     count = points.shape[1]
-    radii = spot(lens, fields=torch.cat([points, middle], 1)).whole.rms_radius
+    whole = spot(lens, fields=torch.cat([points, middle], 1)).whole
+    radii, centre = whole.rms_radius, whole.centroid[:, :count]
     of_fields, of_middle = radii[:count], radii[count:]
     labels = [field_label(lens, point) for point in points.T.tolist()]
     places = [f"at {field_label(lens, point)}" for point in middle.T.tolist()]
@@ -97,18 +98,17 @@ def _of_lens(lens: Lens, configuration: int) -> Iterator[Between]:
     waves = lens.wavelengths.sort().values
     between_waves = 0.5 * (waves[:-1] + waves[1:])
     if len(between_waves):
-        each = _about_whole(lens, points, torch.cat([waves, between_waves]))
-        beside = torch.maximum(each[:, : len(waves) - 1], each[:, 1 : len(waves)])
+        each = _about(centre, lens, points, torch.cat([waves, between_waves]))
+        neighbours = torch.maximum(each[:, : len(waves) - 1], each[:, 1 : len(waves)])
         places = [f"at {wave:.4g} µm, {label}" for label in labels for wave in between_waves.tolist()]
-        yield from _largest("wavelengths", places, each[:, len(waves) :].flatten(), beside.flatten(), configuration)
+        yield from _largest("wavelengths", places, each[:, len(waves) :].flatten(), neighbours.flatten(), configuration)
 
     few = spot(lens, fields=points, rings=DefaultMerit().rings).whole.rms_radius
     yield from _largest("rays", [f"at {label}" for label in labels], of_fields, few, configuration)
 
 
-def _about_whole(lens: Lens, fields: Tensor, wavelengths: Tensor) -> Tensor:
-    """RMS radii (F, W) of single wavelengths about the centroid of the lens's own wavelengths together."""
-    centre = spot(lens, fields=fields).whole.centroid
+def _about(centre: Tensor, lens: Lens, fields: Tensor, wavelengths: Tensor) -> Tensor:
+    """RMS radii (F, W) in mm of single wavelengths about points (2, F) mm."""
     primary_first = torch.cat([lens.primary.reshape(1), wavelengths])
     each = spot(with_wavelengths(lens, primary_first), fields=fields).each
     return (each.mean_square_radius + (each.centroid - centre[..., None]).square().sum(0)).sqrt()[:, 1:]

@@ -27,7 +27,7 @@ from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.optimization.attained import conditions_attained
-from raytrace.optimization.between import between, warn_of_worse
+from raytrace.optimization.between import between, warn_of_worse, worse_between
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.curriculum import Growth, Plan
 from raytrace.optimization.least_squares import SolverOptions
@@ -465,7 +465,7 @@ def search(
         lens, each, losses=losses, starts=run.started, descents=run.followed, stopped=stopped,
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
-    warn_of_worse([gap for gap in between(result.lens) if gap.is_worse])
+    warn_of_worse(worse_between(result.lens))
     warn_of_defects(result.lens)
     if folder is not None and not (share and share.rank):
         try:
