@@ -76,7 +76,7 @@ PUBLIC = {
     "trace": "tracing.ray_listing",
     "trace_engine": "tracing.compiled",
     # optimisation
-    "Condition": "optimization.problem",
+    "Condition": "optimization.conditions",
     "Measure": "optimization.operands.operand",
     "DefaultMerit": "optimization.merit",
     "Merit": "optimization.merit",

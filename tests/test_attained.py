@@ -102,7 +102,7 @@ def test_rows_of_a_merit_function_are_boundaries_of_it(triplet):
     rows[-2] = dataclasses.replace(rows[-2], integers=(number, 0))
     with pytest.warns(NotReached):
         found = rt.optimize(triplet, merit=rows, vary="curvature", cycles=1)
-    bound, exact = found.conditions
+    exact, bound = found.conditions
     assert bound.reached == pytest.approx(float(rt.first_order(found.lens).effective_focal_length), rel=1e-9)
     assert "outweighs it" in bound.why
     assert (exact.relation, exact.met) == ("=", False)

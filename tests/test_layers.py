@@ -16,7 +16,8 @@ COMMANDS = re.compile(r"cli(\.|$)")
 
 #: The value of a lower layer is shown by a higher one: the only imports against the layers, inside its methods.
 SHOWN_BY = {
-    "system.lens": ("tracing.lens_report", "analysis.layout"),
+    "system.lens": ("tracing.lens_report", "analysis.layout", "optimization.conditions"),
+    "tracing.lens_report": ("optimization.attained",),
     "psf_models.result": ("psf_models.figures",),
     "optimization.optimized": ("optimization.optimized_figure",),
 }

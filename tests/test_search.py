@@ -14,13 +14,14 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
+from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.curriculum import Plan, Step
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.one_element import thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
-from raytrace.optimization.problem import NoProblem, conditions_of
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.removal import Removal, without_element
 from raytrace.optimization.saddle_points import Place, enlarged, saddle
 from raytrace.optimization.search import Minima

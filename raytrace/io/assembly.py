@@ -418,6 +418,22 @@ def _in_order(data: OptimizationData | None) -> OptimizationData | None:
     return dataclasses.replace(data, variables=tuple(variables), solves=tuple(solves))
 
 
+def written_conditions(lens: Lens, place: Place) -> str:
+    """The conditions of a lens, in words, but for those that take values of other rows of its merit function."""
+    try:
+        return " ".join(str(condition) for condition in lens.conditions if condition.is_worded)
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
+
+
+def with_written_conditions(lens: Lens, words: str, place: Place) -> Lens:
+    """The lens with the conditions of a line of its file."""
+    try:
+        return lens.with_conditions(words)
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
+
+
 def changes(lens: Lens, again: Lens) -> list[str]:
     """The texts, configurations and optimisation data of a lens that its file does not bring back."""
     pairs: list[tuple[str, object, object]] = [
@@ -432,14 +448,6 @@ def changes(lens: Lens, again: Lens) -> list[str]:
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
     data, read_again = _in_order(lens.optimization_data), _in_order(again.optimization_data)
-    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
-        if read_again is not None:
-            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
-            both = zip(data.variables, read_again.variables, strict=False)
-            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
-            if unbound and free[0] == free[1]:
-                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
-                read_again = dataclasses.replace(read_again, variables=data.variables)
-        if read_again != data:
-            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
+    if data is not None and read_again != data and (data.rules or data.merit or data.tolerances):
+        pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
     return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

@@ -19,10 +19,11 @@ import numpy as np
 
 from raytrace.materials.glass import is_air
 from raytrace.optimization.between import worse_between
+from raytrace.optimization.conditions import Condition, conditions_in_unit
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import Boundaries, DefaultMerit, merit_for
 from raytrace.optimization.opening import opened
-from raytrace.optimization.problem import Condition, NoProblem, conditions_in_unit, typical_of
+from raytrace.optimization.problem import NoProblem, typical_of
 from raytrace.optimization.search_tasks import (
     Journal,
     Minimum,
@@ -31,7 +32,7 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.variables import bounds_of, constraint_words, design_variables, name_of, split_constraint
+from raytrace.optimization.variables import bounds_of, design_variables, split_constraint
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import sensor
@@ -127,23 +128,23 @@ class FirstSearch(Protocol):
 class Plan:
     """A curriculum for a lens of plates: the search problem of every step.
 
-    vary: variables of the first step, by default the lens's; bounds, hold, merit: as for `search`. Raises NoProblem.
+    vary: variables of the first step, by default the lens's; bounds, merit: as for `search`; hold: all conditions.
+    Raises NoProblem.
     """
 
     kind: str
     lens: Lens
     vary: str | Sequence[str] | None
     bounds: str | Sequence[str] | None
-    hold: str | Sequence[str] | Sequence[Condition] | None
+    hold: Sequence[str | Condition]
     merit: DefaultMerit | None
 
     def __post_init__(self) -> None:
         if self.kind not in CURRICULA:
             raise NoProblem(f"{option('kind', self.kind)}: expected {', '.join(CURRICULA)}"
                             f"{did_you_mean(self.kind, CURRICULA)}")  # fmt: skip
-        listed = [self.hold] if isinstance(self.hold, str) else self.hold or ()
-        self.words = constraint_words([word for word in listed if isinstance(word, str)])
-        self.others = [condition for condition in listed if isinstance(condition, Condition)]
+        self.words = [word for word in self.hold if isinstance(word, str)]
+        self.others = [condition for condition in self.hold if isinstance(condition, Condition)]
         lens, held = self.lens, [word for word in self.words if word.startswith("efl=")]
         if not held:
             raise NoProblem(f"{option('kind', self.kind)} needs the focal length: {option('hold')} it, as efl=6")
@@ -164,7 +165,7 @@ class Plan:
         curved = [variable.surface for variable in free.variables if variable.quantity == "curvature"]
         if not curved:
             raise NoProblem(f"{option('kind', self.kind)}: no curvature varies: name them by {option('vary')}")
-        words = [name_of(variable).replace("_", ":") for variable in free.variables]
+        words = [variable.name.replace("_", ":") for variable in free.variables]
         if step.terms:
             places = ",".join(map(str, curved))
             free = design_variables(seen, [*words, *(f"{term}:{places}" for term in step.terms)])

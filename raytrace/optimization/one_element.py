@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from raytrace.optimization.conditions import Condition, surface_arguments
 from raytrace.optimization.operands.boundaries import BOUNDARIES
-from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import Condition, NoProblem
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -27,8 +27,6 @@ from raytrace.optimization.search_tasks import (
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.words import option
-
-_SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 
 
 @dataclass(frozen=True)
@@ -111,14 +109,6 @@ def _family(task: SearchProblem) -> tuple:
 # -- rows of a lens of other surfaces ----------------------------------------------------------------------------------
 
 
-def surface_arguments(row: Row) -> tuple[bool, bool]:
-    """Which of the two integers of a row are numbers of surfaces."""
-    if row.operand in BOUNDARIES:
-        return True, row.operand[:2] in ("MN", "MX")
-    first, second = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    return first in _SURFACES, second in _SURFACES
-
-
 def renumbered(rows: Sequence[Row], number: Callable[[int], int]) -> tuple[Row, ...]:
     """Rows that name the same surfaces by their new numbers."""
     return tuple(
@@ -132,7 +122,8 @@ def renumbered(rows: Sequence[Row], number: Callable[[int], int]) -> tuple[Row, 
 def conditions_renumbered(conditions: Sequence[Condition], number: Callable[[int], int]) -> tuple[Condition, ...]:
     """Conditions whose rows name the same surfaces by their new numbers."""
     rows = renumbered([condition.row for condition in conditions], number)
-    return tuple(replace(condition, row=row) for condition, row in zip(conditions, rows, strict=True))
+    before = (renumbered(condition.before, number) for condition in conditions)
+    return tuple(replace(c, row=row, before=b) for c, row, b in zip(conditions, rows, before, strict=True))
 
 
 def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Row, ...]:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Columns, Result, Table, number, plain, text_table
-from raytrace.optimization.attained import Attained
+from raytrace.maths.result import Column, Columns, Result, Table, number, plain
+from raytrace.optimization.attained import Attained, table_of
 from raytrace.optimization.between import Between
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.glass_choice import GlassStep
@@ -253,17 +253,7 @@ class Optimized(Result):
     def conditions_in_words(self) -> list[str]:
         """The table of targets and attained values of `shown_conditions`."""
         shown = self.shown_conditions()
-        if not shown:
-            return []
-        remarks = [", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in shown]
-        lines = text_table(
-            {
-                Column("condition", form="<"): [row.name for row in shown],
-                Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in shown],
-                Column("reached"): [row.reached for row in shown],
-                Column("remark", form="<", heading=" "): remarks,
-            }
-        )
+        lines = table_of(shown)
         more = len(self.conditions) - len(shown)
         return [*lines, f"and {more} more boundaries, met"] if more else lines
 
@@ -274,5 +264,5 @@ class Optimized(Result):
         return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def save(self, path: str | PathLike) -> None:
-        """Write the lens, with its variables and its merit function; a file does not hold the constraints of `hold`."""
+        """Write the lens, with its variables, its merit function and its conditions."""
         write_lens(self.lens, path)

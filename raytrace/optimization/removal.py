@@ -18,9 +18,10 @@ from functools import cached_property, partial
 import numpy as np
 
 from raytrace.materials.glass import is_air
+from raytrace.optimization.conditions import Condition, without_rows
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.one_element import Move, conditions_renumbered, renumbered, surface_arguments, thinned
-from raytrace.optimization.problem import Condition, NoProblem
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.search_tasks import FOLLOW, LONG, SearchProblem, Stage, TaskResult, descended
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
@@ -204,4 +205,5 @@ def _is_of(row: Row, k: int) -> bool:
 
 def _rows(rows: Sequence[Row], k: int) -> tuple[Row, ...]:
     """The rows of the lens without the element; rows of the element alone are left out."""
-    return renumbered([row for row in rows if not _is_of(row, k)], partial(_number, k=k))
+    gone = (place for place, row in enumerate(rows, 1) if _is_of(row, k))
+    return renumbered(without_rows(rows, gone), partial(_number, k=k))

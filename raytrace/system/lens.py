@@ -6,7 +6,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from typing import Any, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -32,6 +32,9 @@ from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean, option
+
+if TYPE_CHECKING:
+    from raytrace.optimization.conditions import Condition
 
 #: Units of a field point by the kind of field.
 FIELD_UNITS = dict(angle="degrees", object_height="mm", paraxial_image_height="mm", real_image_height="mm")
@@ -401,6 +404,21 @@ class Lens:
     def primary(self) -> Tensor:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
+
+    @property
+    def conditions(self) -> tuple["Condition", ...]:
+        """The conditions that optimisations meet exactly: rows of negative weight of the merit function, lengths
+        in mm, and those that are off. Raises BadHold for one of a surface that the lens does not have."""
+        from raytrace.optimization.conditions import stored_conditions
+
+        return stored_conditions(self)
+
+    def with_conditions(self, conditions: "str | Sequence[str | Condition]", *, only: bool = False) -> "Lens":
+        """The lens with conditions in addition, as "efl=50 total_track<=80 edge>=1" (`optimization.conditions`), each
+        instead of those of the same quantity; "off:efl=50" is stored and not met. only: no others. Raises BadHold."""
+        from raytrace.optimization.conditions import with_conditions
+
+        return with_conditions(self, conditions, only=only)
 
     def __getattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_ELSEWHERE.get(name, '')}", name=name, obj=self)

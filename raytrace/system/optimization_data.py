@@ -32,6 +32,13 @@ class Vary:
     def address(self) -> tuple[int, str]:
         return self.surface, self.quantity
 
+    @property
+    def name(self) -> str:
+        """In bounds and tables: thickness_6, in configuration 2 thickness_6@2; aperture, temperature, pressure."""
+        if not self.surface and self.quantity != "thickness":
+            return self.quantity
+        return f"{self.quantity}_{self.surface}" + (f"@{self.configuration}" if self.configuration else "")
+
     def __str__(self) -> str:
         within = f" from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else ""
         return f"{_where(self)}{within}"

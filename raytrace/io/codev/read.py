@@ -27,7 +27,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import BENT, MOST_POINTS, ONWARD, LensDraft, assemble, clear_aperture, poses_of
+from raytrace.io.assembly import (
+    BENT,
+    MOST_POINTS,
+    ONWARD,
+    LensDraft,
+    assemble,
+    clear_aperture,
+    poses_of,
+    with_written_conditions,
+)
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -140,6 +149,9 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
             draft.sources[quantity] = (keyword, record.place)
     lens = assemble(draft, file)
     _report_left_out(system, report)
+    for record in parts.comments:
+        if record.keyword == "CONDITIONS":
+            lens = with_written_conditions(lens, record.text, record.place)
     return lens
 
 

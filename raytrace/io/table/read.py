@@ -39,6 +39,7 @@ from raytrace.io.assembly import (
     clear_aperture,
     is_code,
     listed_glass,
+    with_written_conditions,
 )
 from raytrace.io.source import (
     MILLIMETRES,
@@ -384,7 +385,7 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources
     places = {row.place.surface: row.place for row in rows}
     for surface, message in unknown_changes(lens).items():
         table.report.warn(message, places.get(surface, table.place))
-    return lens
+    return with_written_conditions(lens, *table.metadata.get("conditions", ("", table.place)))
 
 
 def _numbered(table: Table) -> list[Row]:
