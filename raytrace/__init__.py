@@ -245,6 +245,7 @@ ERRORS = {
     "PictureError": "io.pictures",
     "ProcessLost": "shards",
     "RayTableError": "io.ray_tables",
+    "ReplacedCondition": "optimization.conditions",
     "TakesLong": "budget",
     "TooCoarse": "wave_optics.hybrid",
     "TooManyPoints": "psf_models.dft",

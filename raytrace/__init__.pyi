@@ -82,6 +82,7 @@ from raytrace.maths.numerics import to as to
 from raytrace.optimization.attained import NotReached as NotReached
 from raytrace.optimization.between import WorseBetween as WorseBetween
 from raytrace.optimization.checkpoint import BadCheckpoint as BadCheckpoint
+from raytrace.optimization.conditions import ReplacedCondition as ReplacedCondition
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.least_squares import NoOptimum as NoOptimum

@@ -10,7 +10,7 @@ from problems import SHARED
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.optimization.attained import NotReached, attained_by
-from raytrace.optimization.conditions import BadHold, Replaced, without_rows
+from raytrace.optimization.conditions import BadHold, ReplacedCondition, without_rows
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 
 WORDS = (
@@ -190,7 +190,7 @@ def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(tripl
 
 def test_an_argument_replaces_the_condition_of_the_lens_with_a_warning(triplet):
     lens = triplet.with_conditions("efl=100 edge>=1")
-    with pytest.warns(Replaced, match="efl=95 replaces efl=100, a condition of the lens"):
+    with pytest.warns(ReplacedCondition, match="efl=95 replaces efl=100, a condition of the lens"):
         found = rt.optimize(lens, merit="spot", vary="curvature sensor", hold="efl=95", cycles=6)
     assert efl(found.lens) == pytest.approx(95, rel=1e-8)
     assert in_words(found.lens) == "edge>=1 efl=95"

@@ -43,7 +43,7 @@ from raytrace.words import RaytraceWarning, calling_level, did_you_mean, option
 OFF = "off:"
 
 
-class Replaced(RaytraceWarning):
+class ReplacedCondition(RaytraceWarning):
     """A condition of the lens that another one of the same quantity replaces."""
 
 
@@ -331,7 +331,7 @@ def specified(
     """The merit function of an optimisation, without its conditions, and all conditions, also off ones, in mm.
 
     These are the conditions of the lens, of rows of negative weight of `merit`, and of `hold`, each of which replaces
-    those of the same quantity before it; hold None: without those of the lens. Warns Replaced. Raises BadHold.
+    those of the same quantity before it; hold None: without those of the lens. Warns ReplacedCondition. Raises BadHold.
     """
     function, current = merit_for(lens, merit), lens.current_configuration
     among = [*_of_rows(lens, function.rows, function.unit)]
@@ -344,7 +344,7 @@ def specified(
         if before.on and any(c.excludes(before, current) and c != before for c in added):
             other = next(c for c in added if c.excludes(before, current))
             message = f"{option('hold')}: {other} replaces {before}, a condition of the lens"
-            warnings.warn(message, Replaced, stacklevel=calling_level())
+            warnings.warn(message, ReplacedCondition, stacklevel=calling_level())
     listed: list[Condition] = []
     for group in (of_lens, of_rows, added):
         listed = [c for c in listed if not any(other.excludes(c, current) for other in group)] + [*group]
