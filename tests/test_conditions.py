@@ -237,3 +237,26 @@ def test_variables_of_a_camera_have_the_conditions_of_the_lens(triplet):
     lens = triplet.with_conditions("total_track<=120 efl=101 off:edge>=1")
     assert rt.Variables(lens, "curvature sensor").conditions == ("total_track<=120", "efl=101")
     assert rt.Variables(lens, "curvature sensor", hold="efl bfd>=60").conditions == ("total_track<=120", "bfd>=60")
+
+
+def test_boundaries_and_bounds_of_a_call_are_stored_once(triplet, tmp_path):
+    first = rt.optimize(triplet, merit="spot", vary="curvature sensor", cycles=1)
+    limited = rt.optimize(
+        first.lens, merit=rt.Merit.of(first.lens, edge=1.0), bounds="curvature:-0.03..0.03", cycles=1
+    ).lens
+    count = len(first.lens.optimization_data.merit)
+    assert [row.name for row in limited.optimization_data.merit[count:]] == ["MNEG"]
+    assert limited.optimization_data.variables[0].bounds == (-0.03, 0.03)
+    rt.write_lens(limited, path := tmp_path / "limited.zmx")
+    again = rt.read_lens(path)
+    assert again.optimization_data == limited.optimization_data
+    assert rt.Merit.of(again, edge=1.0).rows == again.optimization_data.merit
+    assert len(rt.Merit.of(again, edge=2.0)) == count + 2
+
+
+def test_a_lens_with_many_boundaries_lists_those_that_are_not_met(triplet):
+    rows = tuple(Row("CTGT", (k, 0), target=3.0, weight=1.0) for k in (1, 2, 3, 4, 5, 6, 7) for _ in range(3))
+    lens = dataclasses.replace(triplet, optimization_data=OptimizationData(merit=rows))
+    text = str(rt.info(lens))
+    assert text.count("not met") == 6
+    assert "and 9 more boundaries, met" in text

@@ -266,13 +266,10 @@ class Held:
 def _of_lens(lens: Lens, words: Sequence[str]) -> list[str]:
     """The conditions of a lens of other quantities than those of words of `hold`. Raises BadVariables."""
     try:
-        given = conditions_of(lens, [word for word in words if word not in ("buildable", "catalog")])
-        current = lens.current_configuration
-        return [
-            str(condition)
-            for condition in lens.conditions
-            if condition.on and condition.is_worded and not any(c.excludes(condition, current) for c in given)
-        ]
+        stored, current = [c for c in lens.conditions if c.on and c.is_worded], lens.current_configuration
+        given = [word for word in words if word not in ("buildable", "catalog")] if stored else ()
+        others = conditions_of(lens, given)
+        return [str(condition) for condition in stored if not any(c.excludes(condition, current) for c in others)]
     except BadHold as error:
         raise BadVariables(str(error)) from error
 
@@ -321,9 +318,10 @@ class Variables(Owned):
         self.design, words = _design(lens, vary), constraint_words(hold)
         self._modelled = to(self.design.lens, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
         efl = [word for word in words if re.fullmatch("efl(=.*)?", word)]
-        self.conditions = (*_of_lens(self.design.lens, words), *(word for word in words if word not in efl))
+        self.conditions = tuple(word for word in words if word not in efl)
         self._all = _variables(self.design, vary)
         self.held = self._held(" ".join(efl))
+        self.conditions = (*_of_lens(self.design.lens, words), *self.conditions)
         self.variables = tuple(v for v in self._all if self.held is None or v is not self.held.by)
         self.names = tuple(variable.name for variable in self._all)
         lower, upper = bounds_of(lens, self.design.variables, bounds)

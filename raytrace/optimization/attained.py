@@ -16,6 +16,7 @@ from raytrace.system.optimization_data import Row
 from raytrace.words import RaytraceWarning
 
 EXACT = 1e-6  # tolerance of a condition, relative to its target, or to 1
+_SHOWN = 12  # conditions and boundaries of a table
 SOFT = 1e-3  # tolerance of a boundary in the merit function, relative to its target, or 1 µm
 
 
@@ -71,7 +72,7 @@ def attained_by(lens: Lens) -> tuple[Attained, ...]:
     None of a batch. Raises BadHold and BadRow for a row of a surface that the lens does not have.
     """
     data = lens.optimization_data
-    if data is None or lens.count is not None:
+    if data is None or lens.count is not None or not any(row.weight < 0 or _is_boundary(row) for row in data.merit):
         return ()
     function, held = specified(lens, Merit(data.merit, data.unit), ())
     rows = [row if _is_boundary(row) else dataclasses.replace(row, weight=0.0) for row in function.rows]
@@ -91,19 +92,28 @@ def in_words(lens: Lens) -> list[str]:
     return [*lines, *off]
 
 
+def shown(results: Sequence[Attained]) -> list[Attained]:
+    """The conditions and boundaries that tables list: all but boundaries that are met, of which the first few."""
+    chosen = [k for k, row in enumerate(results) if not row.met or not row.row]
+    met = [k for k, row in enumerate(results) if row.met and row.row]
+    return [results[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
+
+
 def table_of(results: Sequence[Attained]) -> list[str]:
-    """The lines of a table of conditions and boundaries; none without any."""
+    """The lines of a table of the conditions and boundaries that are `shown`; none without any."""
     if not results:
         return []
-    remarks = [", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in results]
-    return text_table(
+    rows, more = shown(results), len(results) - len(shown(results))
+    remarks = [", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in rows]
+    lines = text_table(
         {
-            Column("condition", form="<"): [row.name for row in results],
-            Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in results],
-            Column("reached"): [row.reached for row in results],
+            Column("condition", form="<"): [row.name for row in rows],
+            Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in rows],
+            Column("reached"): [row.reached for row in rows],
             Column("remark", form="<", heading=" "): remarks,
         }
     )
+    return [*lines, f"and {more} more boundaries, met"] if more else lines
 
 
 def attained(problem: Specification, evaluated: Evaluated) -> tuple[Attained, ...]:

@@ -323,6 +323,12 @@ def with_conditions(lens: Lens, conditions: str | Sequence[str | Condition], *, 
     return dataclasses.replace(lens, optimization_data=dataclasses.replace(data, merit=tuple(rows)))
 
 
+def has_other_rows(lens: Lens) -> bool:
+    """Whether the merit function of a lens has rows other than its conditions, and settings of them."""
+    data = with_conditions(lens, (), only=True).optimization_data
+    return data is not None and any(row.operand not in ("CONF", "PRIM") for row in data.merit)
+
+
 def specified(
     lens: Lens,
     merit: Merit | DefaultMerit | Sequence[Row] | str | None,
@@ -448,12 +454,12 @@ def surface_arguments(row: Row) -> tuple[bool, bool]:
 
 def _name(lens: Lens, condition: Condition, k: int) -> str:
     """The quantity of a row in the syntax of `hold`; "row 7" for one that takes values of other rows."""
-    row = condition.row
-    if not condition.is_worded:
+    row, operand = condition.row, condition.row.operand
+    if condition.before or not isinstance(operand, str):
         return f"row {k}"
     view = lens.configuration(condition.configuration) if condition.configuration else lens
     for name, word in WORDS.items():
-        if word.operand == row.operand:
+        if word.operand == operand:
             try:
                 if word.arguments(view) == (row.integers, row.numbers):
                     return name
@@ -462,14 +468,14 @@ def _name(lens: Lens, condition: Condition, k: int) -> str:
     first, last = row.integers
     span = f":{first}" if first == last else f":{first}-{last}"
     for name, limit in LIMITS.items():
-        if row.operand in limit.operands.values() and row.numbers == limit.numbers:
-            return name if row.integers == _whole(lens, row.operand) else f"{name}{span}"
-    if row.operand == "TTHI" and not any(row.numbers):
+        if operand in limit.operands.values() and row.numbers == limit.numbers:
+            return name if row.integers == _whole(lens, operand) else f"{name}{span}"
+    if operand == "TTHI" and not any(row.numbers):
         return f"thickness{span}"
     numbers = [*map(str, row.integers), *(f"{n:g}" if float(f"{n:g}") == n else repr(n) for n in row.numbers)]
     while numbers and float(numbers[-1]) == 0:
         numbers.pop()
-    return f"{row.operand}({','.join(numbers)})" if numbers else row.operand
+    return f"{operand}({','.join(numbers)})" if numbers else operand
 
 
 def without_rows(rows: Sequence[Row], gone: Iterable[int]) -> tuple[Row, ...]:

@@ -306,7 +306,7 @@ class Merit:
         conventions: Conventions | str | Sequence[str] | None = None,
         skip_unknown: bool = False,
     ) -> "Merit":
-        """The merit function of the lens's file, with boundaries in mm (as of `DefaultMerit`) in addition.
+        """The merit function of the lens's file, with boundaries in mm (as of `DefaultMerit`) that it does not have.
 
         Raises BadMerit if the file has none.
         """
@@ -317,8 +317,9 @@ class Merit:
             lens.optimization_data.merit, lens.optimization_data.unit, conventions=conventions,
             skip_unknown=skip_unknown, boundaries=boundaries,
         )  # fmt: skip
-        limits = boundary_rows(lens, boundaries)
-        return stored + Merit(limits) if limits else stored
+        held = {in_unit(row, stored.unit, 1.0) for row in stored.rows}
+        limits = [row for row in boundary_rows(lens, boundaries) if row.operand == "CONF" or row not in held]
+        return stored + Merit(tuple(limits)) if any(row.operand != "CONF" for row in limits) else stored
 
     @classmethod
     def default(cls, lens: Lens, kind: str = "spot", **settings: Any) -> "Merit":

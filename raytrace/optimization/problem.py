@@ -13,8 +13,9 @@ the vertex sphere, c² r².
 """
 
 import dataclasses
+import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,7 +23,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import Dual, Number, slope_of, value_of
-from raytrace.optimization.conditions import Condition, stored_conditions, with_conditions
+from raytrace.optimization.conditions import Condition, has_other_rows, stored_conditions, with_conditions
 from raytrace.optimization.least_squares import Sides, SumOfSquares
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, Ray, View
 from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, rereferenced
@@ -352,15 +353,21 @@ def optimization_data_of(
     model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition] = ()
 ) -> OptimizationData:
     """Optimisation data of an optimised lens: those of its file, or of this optimisation where that has none but
-    conditions, with the conditions of both, in mm. Semi-diameters that a lens without any data has stay specified."""
+    conditions, with the conditions of both, in mm, and with rows that follow those of the file, as boundaries.
+
+    Semi-diameters that a lens without any data has stay specified.
+    """
     lens, data = model.lens, model.lens.optimization_data
-    of_lens = stored_conditions(lens)
-    if not (data and (data.variables or data.solves or data.kept or data.tolerances or with_conditions(
-        lens, (), only=True).optimization_data.merit)):  # fmt: skip
-        given = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
-        given = given if data is None else data.semi_diameters
+    given = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
+    if data is None or not (data.rules or data.tolerances or has_other_rows(lens)):
+        given, of_lens = given if data is None else data.semi_diameters, stored_conditions(lens)
         data = OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
         lens = with_conditions(dataclasses.replace(lens, optimization_data=data), of_lens)
+    else:
+        count, free = len(data.merit), [dataclasses.replace(row, weight=max(row.weight, 0.0)) for row in data.merit]
+        further = tuple(rows[count:]) if [*rows[:count]] == free else ()
+        data = dataclasses.replace(data, variables=data.variables or model.variables, merit=(*data.merit, *further))
+        lens = dataclasses.replace(lens, optimization_data=data)
     return with_conditions(lens, conditions).optimization_data or data
 
 
@@ -375,12 +382,10 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
         settings += [Row("CONF", (condition.configuration or lens.current_configuration, 0))] if several else []
         start = count + len(settings)
         last = dataclasses.replace(condition.row, weight=-1.0)
-        moved = [rereferenced(row, lambda n, start=start: n + start) for row in condition.before]
+        behind = partial(operator.add, start)
+        moved = [rereferenced(row, behind) for row in condition.before]
         yield from ((row, 0) for row in (*settings, *moved))
-        yield (
-            rereferenced(last, lambda n, start=start: n + start) if moved else last,
-            RELATIONS[condition.relation],
-        )
+        yield (rereferenced(last, behind) if moved else last), RELATIONS[condition.relation]
         count = start + len(moved) + 1
 
 
