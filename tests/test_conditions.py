@@ -17,6 +17,7 @@ WORDS = (
     "efl=100 total_track<=200 edge>=1 off:distortion<=2% bfd>=30 image_height=21.5 glass_thickness:1-3<=10 "
     "REAY(8,0,0,1)<=45"
 )
+SPOT = rt.optimization.DefaultMerit("spot", rings=2, arms=4)
 MERITS = sorted(path.name for path in (SHARED / "merit" / "dev").glob("*.[zZ]*"))
 
 
@@ -78,7 +79,7 @@ def test_rows_of_negative_weight_are_conditions_also_of_other_rows(triplet):
     assert length.reached == pytest.approx(efl(lens), rel=1e-12)
     assert [result.met for result in results] == [False, True, True, True, False]
     assert lens.with_conditions(lens.conditions).optimization_data.merit == rows
-    found = rt.optimize(lens, merit="spot", vary="curvature:1-3 sensor", cycles=8)
+    found = rt.optimize(lens, merit=SPOT, vary="curvature:1-3 sensor", cycles=8)
     assert [result.met for result in found.conditions] == [True] * 5
     assert found.lens.optimization_data.merit == rows
 
@@ -173,7 +174,7 @@ def test_a_zmx_file_keeps_the_bounds_of_all_variables(triplet, tmp_path):
 
 def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(triplet, tmp_path):
     lens = triplet.with_conditions("efl=100 total_track<=115")
-    first = rt.optimize(lens, merit="spot", vary="curvature sensor", hold="bfd>=75", cycles=8)
+    first = rt.optimize(lens, merit=SPOT, vary="curvature:1-4 sensor", hold="bfd>=75", cycles=8)
     assert [str(one.name) for one in first.conditions[:3]] == ["efl", "total_track", "bfd"]
     assert efl(first.lens) == pytest.approx(100, rel=1e-8)
     assert in_words(first.lens) == "efl=100 total_track<=115 bfd>=75"
@@ -191,10 +192,10 @@ def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(tripl
 def test_an_argument_replaces_the_condition_of_the_lens_with_a_warning(triplet):
     lens = triplet.with_conditions("efl=100 edge>=1")
     with pytest.warns(ReplacedCondition, match="efl=95 replaces efl=100, a condition of the lens"):
-        found = rt.optimize(lens, merit="spot", vary="curvature sensor", hold="efl=95", cycles=6)
+        found = rt.optimize(lens, merit=SPOT, vary="curvature:1-3 sensor", hold="efl=95", cycles=6)
     assert efl(found.lens) == pytest.approx(95, rel=1e-8)
     assert in_words(found.lens) == "edge>=1 efl=95"
-    off = rt.optimize(lens, merit="spot", vary="sensor", hold="off:efl=100", cycles=1)
+    off = rt.optimize(lens, merit=SPOT, vary="sensor", hold="off:efl=100", cycles=1)
     assert in_words(off.lens) == "edge>=1 off:efl=100"
     assert [condition.name for condition in off.conditions] == ["edge"]
 
@@ -202,7 +203,7 @@ def test_an_argument_replaces_the_condition_of_the_lens_with_a_warning(triplet):
 def test_commands_honour_and_report_conditions(triplet, tmp_path, capsys):
     path = str(tmp_path / "held.csv")
     rt.write_lens(triplet.with_conditions("efl=100 edge>=1 off:bfd>=80"), path)
-    line = ["optimize", path, "--merit", "spot", "--vary", "curvature", "sensor", "--cycles", "6"]
+    line = ["optimize", path, "--merit", "spot", "--vary", "curvature:1-3", "sensor", "--cycles", "6", "--rings", "2"]
     assert main([*line, "-o", str(tmp_path / "better.zmx")]) == 0
     better = rt.read_lens(tmp_path / "better.zmx")
     assert in_words(better) == "efl=100 edge>=1 off:bfd>=80"
@@ -226,11 +227,11 @@ def test_tolerances_report_a_nominal_lens_that_violates_its_conditions(triplet):
         rt.tolerance(lens, limits="radius=0.1%", trials=0)
 
 
-def test_a_search_meets_the_conditions_of_the_lens(triplet):
-    lens = triplet.with_conditions("efl=100 total_track<=130")
-    found = rt.search(lens, merit=rt.optimization.DefaultMerit("spot", rings=2), vary="curvature sensor", starts=2)
-    assert efl(found.lens) == pytest.approx(100, rel=1e-6)
-    assert in_words(found.lens) == in_words(lens)
+def test_a_search_meets_the_conditions_of_the_lens():
+    lens = rt.read_lens("singlet").with_conditions("efl=60 edge>=1")
+    found = rt.search(lens, merit=SPOT, vary="curvature sensor", starts=1)
+    assert efl(found.lens) == pytest.approx(60, rel=1e-6)
+    assert in_words(found.lens) == "efl=60 edge>=1"
 
 
 def test_variables_of_a_camera_have_the_conditions_of_the_lens(triplet):
@@ -240,7 +241,7 @@ def test_variables_of_a_camera_have_the_conditions_of_the_lens(triplet):
 
 
 def test_boundaries_and_bounds_of_a_call_are_stored_once(triplet, tmp_path):
-    first = rt.optimize(triplet, merit="spot", vary="curvature sensor", cycles=1)
+    first = rt.optimize(triplet, merit=SPOT, vary="curvature sensor", cycles=1)
     limited = rt.optimize(
         first.lens, merit=rt.Merit.of(first.lens, edge=1.0), bounds="curvature:-0.03..0.03", cycles=1
     ).lens

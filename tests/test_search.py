@@ -394,7 +394,7 @@ def phone_plates():
 
 
 def test_a_step_has_its_part_of_aperture_and_field_and_its_terms(phone_plates):
-    plan = Plan("phone", phone_plates, None, None, "efl=6 chief_ray_angle<=30", None)
+    plan = Plan("phone", phone_plates, None, None, ["efl=6", "chief_ray_angle<=30"], None)
     first = plan.problem(phone_plates, Step(0.4, 0.5, 4))
     last = plan.problem(phone_plates, Step(1.0, 1.0, 9, ("conic", "a4"), 6))
     assert float(rt.first_order(first.model.lens).entrance_pupil_diameter) == pytest.approx(0.4 * 3)
