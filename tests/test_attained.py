@@ -91,7 +91,7 @@ def test_boundaries_are_met_within_a_micrometre_or_a_thousandth(triplet):
 
 
 def test_rows_of_a_merit_function_are_boundaries_of_it(triplet):
-    """Rows of arithmetic, by the value of the row that they bound; rows that are met exactly are refused as `hold` is."""
+    """Rows of arithmetic, by the value of the row that they bound; an exact row that nothing moves is refused."""
     rows = [
         *rt.Merit.default(triplet).rows,
         Row("EFFL", (0, 2), weight=0.0),
@@ -100,7 +100,7 @@ def test_rows_of_a_merit_function_are_boundaries_of_it(triplet):
     ]
     number = next(k for k, row in enumerate(rows, 1) if row.operand == "EFFL")
     rows[-2] = dataclasses.replace(rows[-2], integers=(number, 0))
-    with pytest.raises(NoProblem, match="total_track=1000 .now 116.485.: no variable moves it"):
+    with pytest.raises(NoProblem, match=r"total_track=1000 \(now 116.485\): no variable moves it"):
         rt.optimize(triplet, merit=rows, vary="curvature", cycles=1)
     with pytest.warns(NotReached):
         found = rt.optimize(triplet, merit=rows[:-1], vary="curvature", cycles=1)

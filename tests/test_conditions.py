@@ -132,6 +132,22 @@ def test_files_bring_conditions_back(triplet, tmp_path, suffix):
     assert again.optimization_data == lens.optimization_data
 
 
+@pytest.mark.parametrize("suffix", [".zmx", ".csv", ".seq"])
+def test_files_bring_variables_and_their_bounds_back(triplet, tmp_path, suffix):
+    variables = (
+        *(Vary(1, "curvature", bounds=(-0.01, 0.05)), Vary(2, "thickness", bounds=(1.0, 20.0))),
+        *(Vary(4, "curvature"), Vary(6, "conic", bounds=(-float("inf"), 0.0)), Vary(7, "thickness")),
+    )
+    data = OptimizationData(variables, semi_diameters=(1, 2, 3, 4, 5, 6, 7, 8))
+    lens = dataclasses.replace(triplet.replace(6, conic=0.0), optimization_data=data).with_conditions("efl=100")
+    rt.write_lens(lens, path := tmp_path / f"varied{suffix}")
+    assert {v.name: v.bounds for v in rt.read_lens(path).optimization_data.variables} == {
+        v.name: v.bounds for v in variables
+    }
+    found = rt.optimize(path, merit=SPOT, cycles=3)
+    assert efl(found.lens) == pytest.approx(100, rel=1e-6)
+
+
 @pytest.mark.needs(SHARED / "merit" / "dev")
 @pytest.mark.parametrize("name", MERITS)
 def test_rows_of_real_merit_functions_stay_as_they_are(name, tmp_path):

@@ -36,6 +36,7 @@ from raytrace.io.assembly import (
     clear_aperture,
     poses_of,
     with_written_conditions,
+    with_written_variables,
 )
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
@@ -149,9 +150,10 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
             draft.sources[quantity] = (keyword, record.place)
     lens = assemble(draft, file)
     _report_left_out(system, report)
-    for record in parts.comments:
-        if record.keyword == "CONDITIONS":
-            lens = with_written_conditions(lens, record.text, record.place)
+    for keyword, read_into in (("VARIABLES", with_written_variables), ("CONDITIONS", with_written_conditions)):
+        for record in parts.comments:
+            if record.keyword == keyword:
+                lens = read_into(lens, record.text, record.place)
     return lens
 
 

@@ -40,6 +40,7 @@ from raytrace.io.assembly import (
     is_code,
     listed_glass,
     with_written_conditions,
+    with_written_variables,
 )
 from raytrace.io.source import (
     MILLIMETRES,
@@ -385,6 +386,7 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources
     places = {row.place.surface: row.place for row in rows}
     for surface, message in unknown_changes(lens).items():
         table.report.warn(message, places.get(surface, table.place))
+    lens = with_written_variables(lens, *table.metadata.get("variables", ("", table.place)))
     return with_written_conditions(lens, *table.metadata.get("conditions", ("", table.place)))
 
 
