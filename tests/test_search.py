@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
@@ -14,8 +15,12 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
+<<<<<<< HEAD
 from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.curriculum import Plan, Step
+=======
+from raytrace.optimization.curriculum import Growth, Plan, Step
+>>>>>>> main
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.one_element import thinned
@@ -28,6 +33,7 @@ from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
     BadSearch,
     Journal,
+    Minimum,
     SearchProblem,
     SearchStopped,
     TaskResult,
@@ -425,6 +431,21 @@ def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
         rt.search(phone_plates, kind="phone", insert=True)
     with pytest.raises(NoProblem, match="a merit function of its own"):
         rt.search(phone_plates, kind="phone", hold="efl=6", merit="wavefront")
+
+
+def test_the_step_at_which_a_curriculum_ends_is_said(phone_plates, monkeypatch):
+    plan = Plan("phone", phone_plates, None, None, "efl=6", None)
+    start = plan.problem(phone_plates, plan.curriculum.steps[0])
+    minimum = Minimum(TaskResult(0.0, 0.0, 1.0, 0.0, start.model.start), "3, followed", 0.0)
+    growth = Growth(plan, SimpleNamespace(through=lambda progress: None, each=lambda: [(start, minimum)]),
+                    Journal(None, {}, np.inf))  # fmt: skip
+    monkeypatch.setattr(Growth, "_is_far", lambda *args: False)
+    monkeypatch.setattr(Growth, "_descended", lambda self, task, step: TaskResult(2.0, 0.0, 1.0, 0.0, task.model.start))
+    growth.through(None)
+    assert growth.each() == []
+    assert growth.ended == [
+        "from minimum 3, followed: failing rays in 2 rows at 40% of the aperture and 50% of the field"
+    ]
 
 
 @pytest.mark.slow

@@ -242,13 +242,14 @@ MERIT: tuple[Adder, ...] = (
 
 #: --vary, --bounds and --hold: `optimization.variables.design_variables` and `bounds_of`, `optimization.conditions`.
 FREEDOM = group(
-    "variables and constraints, instead of the file's",
+    "variables, instead of the file's, and conditions",
     "vary",
     Option("bounds", None, "NAME:LOW..HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1..0), "
            "open on one side (sensor:30..)", nargs="+"),
     exclusive(
-        Option("hold", help="without the conditions of the lens", flag="--no-hold", action="store_false"),
-        Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens: efl=50 f_number=4 "
+        Option("hold", help="without the conditions of the lens (default: with them)", flag="--no-hold",
+               action="store_false"),
+        Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens (default): efl=50 f_number=4 "
                "'total_track<=80' 'distortion<=2%' 'bfd>=30' "
                "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' 'edge>=1' efl@2=100, or an operand as "
                "REAY(8,0,0,1,0,0)=2; off:efl=50 switches one off", nargs="+"),

@@ -195,12 +195,14 @@ class Plan:
 
 @dataclass
 class Growth:
-    """The steps of a plan from the minima of its first search; first: that search."""
+    """The steps of a plan from the minima of its first search; first: that search; ended: where steps from a minimum
+    ended before the last one, and why."""
 
     plan: Plan
     first: FirstSearch
     journal: Journal
     grown: list[tuple[SearchProblem, Minimum]] = field(default_factory=list)
+    ended: list[str] = field(default_factory=list)
 
     DONE: ClassVar[str] = "steps"
 
@@ -229,7 +231,7 @@ class Growth:
     def _grown(
         self, task: SearchProblem, minimum: Minimum, steps: Sequence[Step], bar: Any
     ) -> tuple[SearchProblem, Minimum] | None:
-        """The lens at the end of the steps from a minimum; None where one of them loses rays.
+        """The lens at the end of the steps from a minimum; None where one of them loses rays or misses a condition.
 
         A step whose start is far from this lens is taken in halves. The last step is repeated with denser fields and
         rays while spots are worse between them.
@@ -252,14 +254,19 @@ class Growth:
                 bar.update(int(number <= len(steps)))
                 bar.set_postfix_str(f"step {number}: merit {result.merit:.6g}")
             if not np.isfinite(result.merit) or result.lost:
-                return None
+                return self._end(minimum, step, f"failing rays in {result.lost:g} rows")
             if not waiting and repeats < _REPEATS and worse_between(task.model.lens_at(result.x)):
                 waiting.append(replace(step, fields=2 * step.fields - 1, rings=step.rings + _MORE_RINGS))
                 repeats += 1
             if not waiting:
                 break
         end = Minimum(result, minimum.task, seconds, minimum.descents)
-        return (task, end) if result.is_valid else None
+        return (task, end) if result.is_valid else self._end(minimum, step, "a condition is not met")
+
+    def _end(self, minimum: Minimum, step: Step, reason: str) -> None:
+        """Note why the steps from a minimum ended."""
+        place = f"{step.aperture:.0%} of the aperture and {step.field:.0%} of the field"
+        self.ended.append(f"from minimum {minimum.task}: {reason} at {place}")
 
     @staticmethod
     def _is_far(task: SearchProblem, merit: float) -> bool:

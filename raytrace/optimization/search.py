@@ -263,9 +263,12 @@ def searched(
     )
 
 
-def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None) -> NoProblem:
-    """The error of a search without minima, with the nearest lens of all its descents, which is written."""
-    parts = [f"no lens without failing rays that meets {option('hold')}, from {starts} starts"]
+def _without_minima(
+    task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None, ended: Sequence[str]
+) -> NoProblem:
+    """The error of a search without minima, with the nearest lens of all its descents, which is written; ended: where
+    the steps of a curriculum ended."""
+    parts = [f"no lens without failing rays that meets {option('hold')}, from {starts} starts", *ended]
     ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
     if ends:
         nearest = min(ends, key=lambda end: end.rank)
@@ -457,7 +460,8 @@ def search(
     except KeyboardInterrupt:
         stopped = "interrupted"
     if not (each := run.each()):
-        raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None)
+        ended = run.ended if isinstance(run, Growth) else ()
+        raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None, ended)
     losses: list[float] = []
     if measured is not None:
         each, losses = _followed_by_loss(each, measured, run.journal, progress)
