@@ -15,12 +15,8 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.glass import is_air
-<<<<<<< HEAD
 from raytrace.optimization.conditions import conditions_of
-from raytrace.optimization.curriculum import Plan, Step
-=======
 from raytrace.optimization.curriculum import Growth, Plan, Step
->>>>>>> main
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.one_element import thinned

@@ -313,9 +313,7 @@ def with_conditions(lens: Lens, conditions: str | Sequence[str | Condition], *, 
         data = OptimizationData(semi_diameters=sized)
     old, current = [*_of_rows(lens, data.merit, data.unit, checked=False)], lens.current_configuration
     same = {c for _, c in old if c in new}
-    gone = {
-        k for k, c in old if c not in same and (only or any(other.excludes(c, current) for other in new))
-    }  # fmt: skip
+    gone = {k for k, c in old if c not in same and (only or any(other.excludes(c, current) for other in new))}
     rows = list(without_rows(data.merit, gone))
     for condition in new:
         if condition not in same:
@@ -390,15 +388,14 @@ def _of_rows(lens: Lens, rows: Sequence[Row], unit: float, *, checked: bool = Tr
 def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
     """The condition of row k, from 1, without a name."""
     row, operand = rows[k - 1], OPERANDS[rows[k - 1].operand]
+    primary = tuple(row for row in rows[:k] if row.operand == "PRIM")[-1:]
     if operand.refers is None:
-        if not any(other.operand == "PRIM" for other in rows[:k]):
-            return Condition(_free(in_unit(row, unit, 1.0)), operand.bounds or "=")
-        return Condition(_free(in_unit(row, unit, 1.0)), operand.bounds or "=", before=_settings(rows, k))
-    taken = operand.refers(Line(k, row, 0), rows)
+        return Condition(_free(in_unit(row, unit, 1.0)), operand.bounds or "=", before=primary)
+    taken = _taken(rows, k)
     if operand.bounds:  # OPLT, ABGT …
-        source, size = rows[taken[0] - 1], row.name.startswith("AB")
-        plain = not size and OPERANDS[source.operand].refers is None and not _settings(rows, k)
-        if plain and configurations_of(rows, 0)[k - 1] == configurations_of(rows, 0)[taken[0] - 1]:
+        source, size, of = rows[taken[0] - 1], row.name.startswith("AB"), configurations_of(rows, 0)
+        plain = OPERANDS[source.operand].refers is None and OPERANDS[source.operand].bounds in ("", operand.bounds)
+        if plain and not (size or primary) and of[k - 1] == of[taken[0] - 1]:
             held = dataclasses.replace(source, target=row.target, weight=0.0)
             return Condition(in_unit(held, unit, 1.0), operand.bounds)
         row = Row("ABSO" if size else "OPVA", row.integers, target=row.target)
@@ -407,8 +404,7 @@ def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
         number = left.pop()
         if number not in needed:
             needed.add(number)
-            refers = OPERANDS[rows[number - 1].operand].refers
-            left += [] if refers is None else refers(Line(number, rows[number - 1], 0), rows)
+            left += _taken(rows, number)
     before: list[Row] = []
     numbers: dict[int, int] = {}
     for number, other in enumerate(rows[:k], 1):
@@ -420,11 +416,6 @@ def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
 
 def _free(row: Row) -> Row:
     return dataclasses.replace(row, weight=0.0)
-
-
-def _settings(rows: Sequence[Row], k: int) -> tuple[Row, ...]:
-    """The last row PRIM above row k, if there is one."""
-    return tuple(row for row in rows[:k] if row.operand == "PRIM")[-1:]
 
 
 def _check_surfaces(lens: Lens, condition: Condition, k: int) -> None:
