@@ -430,7 +430,7 @@ def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
 
 
 def test_the_step_at_which_a_curriculum_ends_is_said(phone_plates, monkeypatch):
-    plan = Plan("phone", phone_plates, None, None, "efl=6", None)
+    plan = Plan("phone", phone_plates, None, None, ["efl=6"], None)
     start = plan.problem(phone_plates, plan.curriculum.steps[0])
     minimum = Minimum(TaskResult(0.0, 0.0, 1.0, 0.0, start.model.start), "3, followed", 0.0)
     growth = Growth(plan, SimpleNamespace(through=lambda progress: None, each=lambda: [(start, minimum)]),
