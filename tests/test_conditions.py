@@ -120,6 +120,19 @@ def test_a_condition_of_a_surface_that_is_gone_is_one_error(triplet):
         triplet.with_conditions("edge=1")
 
 
+def test_edges_are_those_of_the_closed_form(triplet):
+    lens = triplet.with_conditions("edge>=1")
+    thicknesses = []
+    for k in (1, 3, 6):
+        h = max(float(lens.surfaces[j].semi_diameter) for j in (k, k + 1))
+        front, back = (
+            c * h * h / (1 + (1 - c * c * h * h) ** 0.5)
+            for c in (float(lens.surfaces[j].curvature) for j in (k, k + 1))
+        )
+        thicknesses.append(float(lens.surfaces[k].thickness) + back - front)
+    assert attained_by(lens)[0].reached == pytest.approx(min(thicknesses), rel=1e-14)
+
+
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
@@ -199,6 +212,11 @@ def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(tripl
     again = rt.optimize(path, cycles=3)
     assert [condition.met for condition in again.conditions] == [True] * 3
     assert efl(again.lens) == pytest.approx(100, rel=1e-8)
+    held = rt.optimize(
+        triplet, merit=SPOT, vary="curvature:1-4 sensor", hold="efl=100 total_track<=115 bfd>=75", cycles=8
+    )
+    assert held.merit_after == pytest.approx(first.merit_after, rel=1e-12)
+    assert held.lens.conditions == first.lens.conditions
     free = rt.optimize(path, hold=None, cycles=3)
     assert free.conditions == ()
     assert in_words(free.lens) == in_words(first.lens)

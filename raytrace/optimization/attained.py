@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from raytrace.maths.result import Column, text_table
-from raytrace.optimization.conditions import conditions_in_unit, specified
+from raytrace.optimization.conditions import conditions_in_unit, specified, with_taken
 from raytrace.optimization.merit import Evaluated, Merit, arguments
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import RELATIONS, Specification
@@ -75,7 +75,11 @@ def attained_by(lens: Lens) -> tuple[Attained, ...]:
     if data is None or lens.count is not None or not any(row.weight < 0 or _is_boundary(row) for row in data.merit):
         return ()
     function, held = specified(lens, Merit(data.merit, data.unit), ())
-    rows = [row if _is_boundary(row) else dataclasses.replace(row, weight=0.0) for row in function.rows]
+    bounding = [k for k, row in enumerate(function.rows, 1) if _is_boundary(row) and row.weight]
+    needed = with_taken(function.rows, bounding)
+    rows = [
+        row if k in needed or row.operand in ("CONF", "PRIM") else Row("BLNK") for k, row in enumerate(function.rows, 1)
+    ]
     conditions = conditions_in_unit(lens, held, data.unit)
     model = DesignVariables(lens)
     specification = Specification(model, rows, conditions, unit=data.unit, skip_unknown=True)

@@ -358,8 +358,8 @@ def specified(
             f"{option('merit')}: {next(c for c in of_lens if c.before)} takes values of other rows, in units of "
             f"{unit:g} mm, and the merit function is in units of {function.unit:g} mm: use the unit of the file"
         )
-    free = function.with_weights({k: 0.0 for k, condition in among if condition.on})
-    return free, tuple(listed)
+    exact = {k: 0.0 for k, condition in among if condition.on}
+    return function.with_weights(exact) if exact else function, tuple(listed)
 
 
 def _of_rows(lens: Lens, rows: Sequence[Row], unit: float, *, checked: bool = True) -> Iterator[tuple[int, Condition]]:
@@ -399,12 +399,7 @@ def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
             held = dataclasses.replace(source, target=row.target, weight=0.0)
             return Condition(in_unit(held, unit, 1.0), operand.bounds)
         row = Row("ABSO" if size else "OPVA", row.integers, target=row.target)
-    needed, left = set(), list(taken)
-    while left:
-        number = left.pop()
-        if number not in needed:
-            needed.add(number)
-            left += _taken(rows, number)
+    needed = with_taken(rows, taken)
     before: list[Row] = []
     numbers: dict[int, int] = {}
     for number, other in enumerate(rows[:k], 1):
@@ -479,6 +474,18 @@ def without_rows(rows: Sequence[Row], gone: Iterable[int]) -> tuple[Row, ...]:
     new = {k: place for place, k in enumerate((k for k in taken if k not in gone or k in stay), 1)}
     kept = (_free(rows[k - 1]) if k in stay else rows[k - 1] for k in new)
     return tuple(rereferenced(row, lambda n: new.get(n, n)) for row in kept)
+
+
+def with_taken(rows: Sequence[Row], numbers: Iterable[int]) -> set[int]:
+    """Numbers of rows, from 1, and of all rows whose values these take."""
+    needed: set[int] = set()
+    left = list(numbers)
+    while left:
+        number = left.pop()
+        if number not in needed:
+            needed.add(number)
+            left += _taken(rows, number)
+    return needed
 
 
 def _taken(rows: Sequence[Row], k: int) -> list[int]:

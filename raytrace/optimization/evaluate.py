@@ -245,7 +245,7 @@ def evaluate(
     ]
     if lens.count is not None:
         return _of_batch(lens, function, shown)
-    free = [replace(row, weight=max(row.weight, 0.0)) for row in function.rows]
+    free = [replace(row, weight=0.0) if row.weight < 0 else row for row in function.rows]
     evaluation = Evaluation(DesignVariables(lens), free, **function.options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
     weights = np.minimum(evaluation.weights, [row.weight for row in function.rows])

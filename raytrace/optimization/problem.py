@@ -364,7 +364,10 @@ def optimization_data_of(
         data = OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
         lens = with_conditions(dataclasses.replace(lens, optimization_data=data), of_lens)
     else:
-        count, free = len(data.merit), [dataclasses.replace(row, weight=max(row.weight, 0.0)) for row in data.merit]
+        count, free = (
+            len(data.merit),
+            [dataclasses.replace(row, weight=0.0) if row.weight < 0 else row for row in data.merit],
+        )
         further = tuple(rows[count:]) if [*rows[:count]] == free else ()
         data = dataclasses.replace(data, variables=data.variables or model.variables, merit=(*data.merit, *further))
         lens = dataclasses.replace(lens, optimization_data=data)
