@@ -506,6 +506,25 @@ class Lens:
         check(lens)
         return lens
 
+    def with_temperatures(self, temperatures: Sequence[float], *, mount: str | float | None = None) -> "Lens":
+        """The lens with configurations: the first as it is, then one for each of these temperatures, °C.
+
+        Operands TEMP, CRVT, THIC, PRAM and SDIA hold its numbers, as OpticStudio's thermal pickups: in an optimisation
+        those of the first configuration vary, and the others follow by expansion. Solved numbers stay solved in every
+        configuration. Semi-diameters become fixed: there the spacers have contact. mount: as of `at`. Raises ValueError
+        for a lens with configurations, and for surfaces other than conics and even aspheres.
+        """
+        from raytrace.tracing.geometry import contact_heights
+
+        lens = with_environment(self if mount is None else with_mount(self, mount), None, None)
+        heights = contact_heights(lens, in_contact(lens.surfaces))
+        sizes = {k: float(height.detach()) or None for k, height in heights.items()}
+        surfaces = tuple(
+            dataclasses.replace(s, semi_diameter=sizes.get(k, s.semi_diameter)) for k, s in enumerate(lens.surfaces)
+        )
+        lens = dataclasses.replace(lens, surfaces=surfaces)
+        return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
+
     def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
