@@ -25,22 +25,27 @@ def air_spaced(**last):
     return rt.lens(rows, stop=1, entrance_pupil_diameter=12.0, fields=[0, 2], **colours)
 
 
+def simple():
+    """It on its axis, in one colour."""
+    return air_spaced().at(fields=[0], wavelengths=[0.5876])
+
+
 @pytest.fixture(scope="module")
 def shown():
-    return rt.thermal(air_spaced(), [-20, 60], samples=3, modulation_frequency=20)
+    return rt.thermal(simple(), [-20, 60], samples=3, modulation_frequency=20)
 
 
 def test_the_analysis_has_the_numbers_of_the_lens_at_each_temperature(shown):
     for k, celsius in enumerate((-20.0, 20.0, 60.0)):
-        lens = air_spaced().at(temperature=celsius, mount="aluminium")
-        focused = rt.focus(lens, fields=[0, 2], wavelengths=lens.wavelengths)
+        lens = simple().at(temperature=celsius, mount="aluminium")
+        focused = rt.focus(lens)
         assert shown.effective_focal_length[k] == rt.first_order(lens).effective_focal_length
         assert shown.sensor_distance[k] == lens.surfaces[-2].thickness
         assert shown.rms[1, k].item() == pytest.approx(focused.rms_radius().item(), rel=1e-9)
         assert shown.rms[0, k].item() == pytest.approx(focused.rms_radius(lens.surfaces[-2].thickness).item(), rel=1e-9)
-        curve = rt.mtf(lens, [20], fields=[0, 2])
-        lowest = torch.minimum(curve.tangential, curve.sagittal).min().item()
-        assert shown.modulation[0, k].item() == pytest.approx(lowest, abs=1e-12)
+    curve = rt.mtf(lens, [20])
+    lowest = torch.minimum(curve.tangential, curve.sagittal).min().item()
+    assert shown.modulation[0, 2].item() == pytest.approx(lowest, abs=1e-12)
     assert shown.focus_shift[1].item() == pytest.approx(0.0, abs=1e-12)
     assert bool((shown.rms[0] >= shown.rms[1]).all())
     assert shown.depth_of_focus.item() == pytest.approx(0.5e-3 * 0.5876 / 0.06**2, rel=0.02)
@@ -68,9 +73,9 @@ def test_the_command_prints_the_analysis(command):
 
 def test_a_range_and_a_mount_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"`temperatures` \[60, -20\]: expected the lowest and the highest"):
-        rt.thermal(air_spaced(), [60, -20])
+        rt.thermal(simple(), [60, -20])
     with pytest.raises(ValueError, match="mount 'wood'"):
-        rt.thermal(air_spaced(), mount="wood")
+        rt.thermal(simple(), mount="wood")
 
 
 # -- temperatures as configurations -----------------------------------------------------------------------------------
@@ -92,7 +97,7 @@ def test_configurations_are_the_lens_at_each_temperature():
         assert numbers(lens.configuration(number)) == numbers(start.at(temperature=celsius))
     with pytest.raises(ValueError, match="a lens of 3 configurations; expected one"):
         lens.with_temperatures([0])
-    with pytest.raises(ValueError, match="surface 1 is none: .* conics and even aspheres"):
+    with pytest.raises(ValueError, match=r"surface 1 is none: .* conics and even aspheres"):
         air_spaced().replace(1, tilt_x=1.0).with_temperatures([0])
 
 

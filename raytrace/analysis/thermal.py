@@ -86,13 +86,20 @@ class Thermal(Analysis):
         shift, spots, contrast = (ruled(panel) for panel in figure.subplots(1, 3))
         depth = 1e3 * float(self.depth_of_focus)
         shift.axhspan(-depth, depth, color=FAINT, alpha=0.45, linewidth=0, label=f"±{depth:.3g} µm: λ/4 of wavefront")
-        shift.plot(celsius, 1e3 * array(self.focus_shift), "o-", color=INK, markersize=3.5, label="best focus")
+        shift.plot(
+            celsius,
+            1e3 * array(self.focus_shift),
+            "o-",
+            color=INK,
+            markersize=3.5,
+            label="best focus, the sensor fixed",
+        )
         for curve, (name, colour) in enumerate(_LARGER.items()):
             look: dict[str, Any] = dict(color=colour, markersize=3.5, label=f"sensor {name}")
             spots.plot(celsius, 1e3 * array(self.rms[curve]), "o-", **look)
             contrast.plot(celsius, array(self.modulation[curve]), "o-", **look)
         cycles = number_text(float(self.frequency), 4)
-        names = "focus from the sensor (µm)", "RMS spot radius (µm)", f"lowest modulation at {cycles} cycles/mm"
+        names = "focus shift (µm)", "RMS spot radius (µm)", f"lowest modulation at {cycles} cycles/mm"
         for panel, name in zip((shift, spots, contrast), names, strict=True):
             panel.set_xlabel("temperature (°C)")
             panel.set_ylabel(name)
