@@ -151,13 +151,13 @@ class DesignVariables:
     @cached_property
     def growths(self) -> dict[Solve, tuple[list[float], list[float]]]:
         """Factors of surfaces and of media, as of `expansion.growth`, from the source of a thermal pickup to it."""
-        pairs = {(rule.source, rule.configuration) for rule in self.solves if rule.kind == "thermal"}
-        factors = {}
-        for source, configuration in pairs:
+        rules = [rule for rule in self.solves if rule.kind == "thermal"]
+        factors: dict[tuple[int, int], tuple[list[float], list[float]]] = {}
+        for source, configuration in {(rule.source, rule.configuration) for rule in rules}:
             start, here = (with_operands(self.lens, number) for number in (source, configuration))
-            both = growth(start.surfaces, (temperature_of(here) - temperature_of(start)).detach())
-            factors[source, configuration] = tuple([float(s.detach()) for s in each] for each in both)
-        return {rule: factors[rule.source, rule.configuration] for rule in self.solves if rule.kind == "thermal"}
+            faces, behind = growth(start.surfaces, temperature_of(here) - temperature_of(start))
+            factors[source, configuration] = [*map(float, faces)], [*map(float, behind)]
+        return {rule: factors[rule.source, rule.configuration] for rule in rules}
 
     def is_of_edges(self, rule: Solve) -> bool:
         """Whether a thermal pickup is that of a space, whose thickness follows from the edges of its surfaces."""
