@@ -45,6 +45,7 @@ PUBLIC = {
     "AIR": "materials.glass",
     "MIRROR": "materials.glass",
     "Glass": "materials.glass",
+    "MOUNTS": "materials.mounts",
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
@@ -129,6 +130,7 @@ PUBLIC = {
     "ray_fan": "analysis.fans",
     "relative_illumination": "analysis.illumination",
     "rms_over_field": "analysis.rms",
+    "thermal": "analysis.thermal",
     "seidel": "analysis.seidel",
     "wavefront": "analysis.wavefronts",
     "grid": "maths.sampling",
@@ -271,7 +273,7 @@ TOP = (
     *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
-    *("rms_over_field", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
+    *("rms_over_field", "thermal", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
     *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
 )
 #: Packages whose public names are typed with them.

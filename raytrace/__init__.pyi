@@ -37,6 +37,7 @@ from raytrace.analysis.setting import Incomplete as Incomplete
 from raytrace.analysis.setting import NothingToShow as NothingToShow
 from raytrace.analysis.sheared_batch import ClippedBeam as ClippedBeam
 from raytrace.analysis.spot_diagram import spot as spot
+from raytrace.analysis.thermal import thermal as thermal
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong

@@ -20,7 +20,7 @@ from raytrace.optimization.attained import NotReached
 from raytrace.optimization.variables import VariedGlass, design_variables
 from raytrace.settings import CodesignSettings
 from raytrace.system import configurations
-from raytrace.system.lens import media
+from raytrace.system.lens import media, with_environment
 from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.parameter_paths import BadVariables, parse_bounds
 from raytrace.tracing.compiled import prepare
@@ -412,8 +412,7 @@ def test_temperature_and_pressure_are_parameters(lens):
     assert float(rt.spot(changed, fields=[5.0]).whole.rms_radius.detach()) == pytest.approx(float(start), rel=1e-12)
     rt.spot(changed, fields=[5.0]).whole.rms_radius.sum().backward()
     ends = [
-        float(rt.spot(lens.at(temperature=20.0 + step, pressure=1.0), fields=[5.0]).whole.rms_radius)
-        for step in (0.1, -0.1)
+        float(rt.spot(with_environment(lens, 20.0 + step, 1.0), fields=[5.0]).whole.rms_radius) for step in (0.1, -0.1)
     ]
     assert float(variables.temperature.grad) == pytest.approx(10 * (ends[0] - ends[1]) / 0.2, rel=1e-5)
     moved(variables, temperature=100.0)

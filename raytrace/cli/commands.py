@@ -687,6 +687,21 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         row("samples", "wavelengths of the curve", default=101),
     ),
     _command(
+        "thermal",
+        "focus, focal length, spot and MTF over temperature",
+        "Focal length, back focal distance, focus shift, RMS spot radius and the lowest MTF of all fields over "
+        "temperature, with the sensor fixed in the mount, by default aluminium, and refocused.",
+        """
+        double_gauss --range -20 60 --mount aluminium --plot thermal.png
+        cemented_achromat --mount invar --modulation-frequency 40 --json
+        lens.zmx --range -40 85 --samples 6 --mount 12.5 -o thermal.csv""",
+        *LENS, CONDITIONS, plot("focus shift, spot and MTF"), TABLE, "fields",
+        Option("temperatures", finite, ("LOW", "HIGH"), "lowest and highest temperature, °C (default -20 60)",
+            flag="--range", nargs=2),
+        row("samples", "temperatures", default=9),
+        Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
+    ),
+    _command(
         "distortion-grid",
         "grid distortion",
         "Image of a square grid of object points up to the largest field, compared with its ideal image.",

@@ -246,6 +246,11 @@ class Kind:
         heads = len(self.heads)
         return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
 
+    def power_of(self, entry: int) -> int:
+        """The power of length of a coefficient, counted from 0."""
+        name = self.name_of(entry)
+        return {"curvature_x": -1, "conic_x": 0}[name] if entry < len(self.heads) else 1 - int(name[1:])
+
     @property
     def powers(self) -> str:
         """The powers of r that a file holds, in words."""
