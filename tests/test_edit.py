@@ -61,7 +61,8 @@ def test_rays_of_a_scaled_lens_are_scaled(name):
         assert_close(getattr(after, length), 1.7 * getattr(before, length), rtol=1e-12, atol=0.0)
     assert_close(after.f_number, before.f_number, rtol=1e-12, atol=0.0)
     spots = [quietly(rt.spot, each, rings=4).rms_radius for each in (lens, larger)]
-    assert_close(spots[1], 1.7 * spots[0], rtol=1e-11, atol=1e-13)
+    rounding = 1e-15 * abs(float(before.effective_focal_length))
+    assert_close(spots[1], 1.7 * spots[0], rtol=1e-11, atol=rounding)
 
 
 def test_seidel_sums_of_a_scaled_lens_are_scaled():
@@ -198,9 +199,12 @@ def test_frequencies_and_arithmetic_have_their_power_and_unknown_units_are_named
 
 
 def test_rules_configurations_and_tolerances_are_scaled():
-    lens = rt.read_lens("cooke_triplet").with_configurations(thickness={6: [80.0, 85.0]}, curvature={1: [0.02, 0.03]})
-    solves = (Solve(3, "curvature", "pickup", source=1, scale=2.0, offset=0.01),
-              Solve(4, "thickness", "position", (30.0,), source=1), Solve(6, "curvature", "power", (0.02,)))  # fmt: skip
+    lens = rt.read_lens("cooke_triplet").with_configurations(thickness={7: [80.0, 85.0]}, curvature={1: [0.02, 0.03]})
+    solves = (
+        Solve(3, "curvature", "pickup", source=1, scale=2.0, offset=0.01),
+        Solve(4, "thickness", "position", (30.0,), source=1),
+        Solve(7, "curvature", "power", (0.02,)),
+    )
     lines = (
         "TOL TRAD 1 0 -0.2 0.3 0 0 0",
         "TOL TRAD 1 1 -0.2 0.3 0 0 0",
@@ -279,16 +283,16 @@ def test_a_group_is_turned_in_its_place():
     assert radii == [-float(lens.surfaces[2].radius), -float(lens.surfaces[1].radius)]
     assert new.surfaces[2].thickness is lens.surfaces[2].thickness
     with pytest.raises(rt.BadEdit, match="whole cemented group"):
-        rt.edit.reverse("cemented_achromat", "2-3" if "cemented" in "cemented_achromat" else "1-2")
+        rt.edit.reverse("cemented_achromat", "2-3")
     with pytest.raises(rt.BadEdit, match="odd number of mirrors"):
         rt.edit.reverse("scan_lens")
 
 
 def test_pickups_rows_and_tolerances_follow_a_turned_group():
     lens = rt.read_lens("cooke_triplet")
-    solves = (Solve(2, "curvature", "pickup", source=1, scale=-1.0), Solve(6, "curvature", "f_number", (4.0,)),
+    solves = (Solve(2, "curvature", "pickup", source=1, scale=-1.0), Solve(7, "curvature", "f_number", (4.0,)),
               Solve(2, "thickness", "pickup", source=1, offset=1.0))  # fmt: skip
-    lines = ("TOL TRAD 1 0 -0.2 0.3 0 0 0", "TOL TTHI 1 2 -0.1 0.1 0", "TOL TETX 1 2 -0.2 0.3 0", "TOL COMP 6 0 0 0")
+    lines = ("TOL TRAD 1 0 -0.2 0.3 0 0 0", "TOL TTHI 1 2 -0.1 0.1 0", "TOL TETX 1 2 -0.2 0.3 0", "TOL COMP 7 0 0 0")
     lines = (*lines, "TOL TSDY 3 0 -0.1 0.2 0", "TCMM kept")
     rows = [
         Row("CVGT", (1, 0), target=0.01, weight=1),
@@ -298,16 +302,19 @@ def test_pickups_rows_and_tolerances_follow_a_turned_group():
     lens = with_rows(
         lens, rows, variables=(Vary(1, "curvature", bounds=(0.01, 0.05)),), solves=solves, tolerances=lines
     )
-    with pytest.warns(rt.LeftOut, match=r"reverse 1-6: .*: solve curvature of surface 6: f_number 4$"):
+    with pytest.warns(rt.LeftOut, match=r"reverse 1-7: .*: solve curvature of surface 7: f_number 4$"):
         new = rt.edit.reverse(lens).optimization_data
-    assert new.variables == (Vary(6, "curvature", bounds=(-0.05, -0.01)),)
-    assert new.solves == (Solve(5, "curvature", "pickup", source=6, scale=-1.0),
-                          Solve(4, "thickness", "pickup", source=5, offset=1.0))  # fmt: skip
+    # pickups look back: the number in front is the variable, as in files
+    assert new.variables == (Vary(6, "curvature", bounds=(0.01, 0.05)),)
+    assert new.solves == (
+        Solve(7, "curvature", "pickup", source=6, scale=-1.0),
+        Solve(6, "thickness", "pickup", source=5, offset=-1.0),
+    )
     assert [(row.operand, row.integers, row.target) for row in new.merit] == [
-        ("CVLT", (6, 0), -0.01), ("MNCG", (1, 5), 2), ("SPHA", (0, 2), 0.0)]  # fmt: skip
-    assert new.tolerances == ("TOL TRAD 6 0 -0.3 0.2 0 0 0", "TOL TTHI 5 4 -0.1 0.1 0", "TOL MPVT 1 0 0 0 0 0 0",
-                              "TOL TETX 5 6 -0.3 0.2 0", "TOL MPVT 0 0 0 0 0 0 0", "TOL COMP 6 0 0 0",
-                              "TOL TSDY 4 0 -0.1 0.2 0", "TCMM kept")  # fmt: skip
+        ("CVLT", (7, 0), -0.01), ("MNCG", (2, 6), 2), ("SPHA", (0, 2), 0.0)]  # fmt: skip
+    assert new.tolerances == ("TOL TRAD 7 0 -0.3 0.2 0 0 0", "TOL TTHI 6 5 -0.1 0.1 0", "TOL MPVT 1 0 0 0 0 0 0",
+                              "TOL TETX 6 7 -0.3 0.2 0", "TOL MPVT 0 0 0 0 0 0 0", "TOL COMP 7 0 0 0",
+                              "TOL TSDY 5 0 -0.1 0.2 0", "TCMM kept")  # fmt: skip
 
 
 # -- insert, delete, join ----------------------------------------------------------------------------------------------
@@ -318,7 +325,7 @@ def zoom() -> rt.Lens:
     lens = rt.read_lens("cooke_triplet").with_configurations(thickness={2: [5.0, 6.0], 4: [10.0, 9.0]})
     solves = (
         Solve(3, "curvature", "pickup", source=1, scale=-1.1),
-        Solve(6, "thickness", "marginal_height", (0.0, 0.0)),
+        Solve(7, "thickness", "marginal_height", (0.0, 0.0)),
     )
     variables = (Vary(5, "curvature"), Vary(1, "thickness"), Vary(4, "thickness", 2, 1))
     lines = (
@@ -342,7 +349,10 @@ def test_a_plane_without_thickness_changes_nothing(before):
     new = rt.edit.insert(lens, before)
     assert len(new.surfaces) == len(lens.surfaces) + 1
     values = [quietly(rt.evaluate, each) for each in (lens, new)]
-    assert_close(values[1].value, values[0].value, rtol=1e-10, atol=1e-10)
+    # MNCA counts the gap without thickness, too, and OSUM adds its value
+    same = [k for k, row in enumerate(lens.optimization_data.merit) if row.name not in ("MNCA", "OSUM")]
+    before_and_after = (vector(*each.to_frame()["value"])[same] for each in values)
+    assert_close(*before_and_after, rtol=1e-10, atol=1e-10)
     for number in (1, 2):
         powers = [rt.first_order(each.configuration(number)).power for each in (lens, new)]
         assert_close(*powers, rtol=1e-13, atol=0.0)
@@ -385,16 +395,14 @@ def test_a_stop_that_is_deleted_stays_as_a_plane():
 def test_edits_that_a_lens_does_not_allow_are_refused():
     for edit, at, words in (
         (rt.edit.delete, 9, "surfaces 9-9: this lens has surfaces 0 to 8"),
-        (rt.edit.delete, "1-7", "stays"),
         (rt.edit.join, 1, "refracts"),
         (rt.edit.insert, 0, "in front of the object"),
         (rt.edit.split, "2-3", "no glass"),
         (rt.edit.split, "1-3", "two surfaces of one element"),
         (rt.edit.delete, "nothing", "no surface has the comment 'nothing'"),
     ):
-        if words != "stays":
-            with pytest.raises(rt.BadEdit, match=words):
-                edit("cooke_triplet", at)
+        with pytest.raises(rt.BadEdit, match=words):
+            edit("cooke_triplet", at)
     with pytest.raises(rt.BadEdit, match="is a mirror"):
         rt.edit.delete("hubble", 2)
 
@@ -405,7 +413,7 @@ def test_surfaces_are_chosen_by_their_comment():
     assert (lens.name, first) == ("achromat", 2)
     lens = rt.edit.rename(lens, comments={"front doublet": "", 1: "front doublet"})
     whole = rt.edit.reverse(lens, "front doublet")
-    assert [*differences(whole, rt.edit.reverse(lens, rt.system.lens.__name__ and "1-3"))] == []
+    assert [*differences(whole, rt.edit.reverse(lens, "1-3"))] == []
 
 
 # -- split and bend ----------------------------------------------------------------------------------------------------
@@ -487,6 +495,17 @@ FILES = sorted(
 )
 
 
+def assert_same_but_for_spelling(new, lens):
+    """Whether two lenses are alike, also in what the lines of their tolerances mean."""
+    rows = ([dataclasses.replace(row, source="") for row in tolerances_of(each)] for each in (new, lens))
+    for one, other in zip(*rows, strict=True):
+        assert one == other
+    if lens.optimization_data is not None:
+        lines = lens.optimization_data.tolerances
+        new = dataclasses.replace(new, optimization_data=dataclasses.replace(new.optimization_data, tolerances=lines))
+    assert [*differences(new, lens)] == []
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem[-40:])
 def test_files_keep_their_numbers_through_edits(path):
     """A plane that is inserted and joined, and a lens that is turned twice, or scaled there and back, is the lens."""
@@ -507,10 +526,10 @@ def test_files_keep_their_numbers_through_edits(path):
         with warnings.catch_warnings():
             warnings.simplefilter("error", rt.LeftOut)
             again = rt.edit.join(new, before) if not new.surfaces[before].is_mirror else lens
-        assert [*differences(again, lens)] == []
+        assert_same_but_for_spelling(again, lens)
     larger = quietly(rt.edit.scale, lens, 2.0)
     smaller = quietly(rt.edit.scale, larger, 0.5)
-    assert [*differences(dataclasses.replace(smaller, name=lens.name), lens)] == []
+    assert_same_but_for_spelling(dataclasses.replace(smaller, name=lens.name), lens)
     try:
         back = quietly(rt.edit.reverse, quietly(rt.edit.reverse, lens))
     except rt.BadEdit:
@@ -538,7 +557,7 @@ def test_the_command_edits_in_order(tmp_path, capsys):
     [
         ([], "no edit is given"),
         (["--reverse", "foo"], "no surface has the comment 'foo'"),
-        (["--bend", "1-2"], "1-2: 0 values behind the surfaces, expected 1"),
+        (["--bend", "1-2"], "no surfaces; give numbers as 3-4"),
         (["--bend", "1-2", "flat"], "'flat': expected a shape factor"),
         (["--split", "1-2", "air=2"], "no setting 'air'"),
         (["--delete"], "no surfaces; give numbers"),

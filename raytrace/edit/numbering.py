@@ -54,7 +54,9 @@ class Numbering:
     """The new numbers of the surfaces of a lens.
 
     lens: before the edit; surfaces, gaps: (S,) the new number of each, None where it is gone; turned: the surfaces that
-    are turned around, with `turn`. lost: the names of all that is left out, which `with_surfaces` fills.
+    are turned around, with `turn`. joined: the new number of a gap that is part of another, for rows, which may name
+    one gap twice; thicker: mm by which a gap has grown, by its old number. lost: the names of all that is left out,
+    which `with_surfaces` fills.
     """
 
     lens: Lens
@@ -62,6 +64,8 @@ class Numbering:
     gaps: tuple[int | None, ...]
     turned: range = range(0)
     turn: Callable[[Surface], Surface] = lambda surface: surface
+    joined: dict[int, int] = field(default_factory=dict)
+    thicker: dict[int, float] = field(default_factory=dict)
     lost: list[str] = field(default_factory=list)
 
     def with_surfaces(
@@ -130,9 +134,10 @@ class Numbering:
         return ("surfaces", number, *inner), sign
 
     def ends(self, first: int, last: int, *, of_gaps: bool = False) -> tuple[int, int] | None:
-        """The ends of a range of surfaces, or gaps, by their new numbers; None where all are gone."""
-        numbers = self.gaps if of_gaps else self.surfaces
-        kept = [number for number in numbers[min(first, last) : max(first, last) + 1] if number is not None]
+        """The ends of a range of surfaces, or gaps, of a row by their new numbers; None where all are gone."""
+        numbers = dict(enumerate(self.gaps)) | self.joined if of_gaps else dict(enumerate(self.surfaces))
+        new = (numbers[k] for k in range(min(first, last), max(first, last) + 1))
+        kept = [number for number in new if number is not None]
         return (min(kept), max(kept)) if kept else None
 
     # -- configurations -----------------------------------------------------------------------------------------------
@@ -180,10 +185,13 @@ class Numbering:
     def data(self, data: OptimizationData, operands: Sequence[int | None]) -> OptimizationData:
         """Optimisation data of the new lens; operands: the new position of each operand of the configurations."""
         sizes = [self.surfaces[surface] for surface in data.semi_diameters if surface < len(self.surfaces)]
+        variables, solves = self.variables(data.variables, operands), self.solves(data.solves, operands)
+        if self.turned:
+            variables, solves = _backwards(variables, solves)
         return replace(
             data,
-            variables=self.variables(data.variables, operands),
-            solves=self.solves(data.solves, operands),
+            variables=variables,
+            solves=solves,
             kept=self.solves(data.kept, operands),
             merit=self.rows(data.merit, operands),
             tolerances=self.lines(data.tolerances, operands),
@@ -225,7 +233,8 @@ class Numbering:
             is_one = (solve.source in self.turned) == (solve.surface in self.turned)
             changes = {"source": source} if source is not None and is_one else None
         elif place is not None and solve.kind in _NUMBERED and solve.numbers:
-            source = self.surfaces[int(solve.numbers[0])]
+            old = int(solve.numbers[0])
+            source = self.surfaces[old] if 0 <= old < len(self.surfaces) else old
             changes = None if source is None else {"numbers": (float(source), *solve.numbers[1:])}
         elif solve.kind in _BY_RAYS and solve.surface in self.turned and place != (solve.surface, solve.quantity, 1.0):
             changes = None
@@ -241,8 +250,13 @@ class Numbering:
             return None
         surface, quantity, of_source = source
         new = self.moved(solve.surface, solve.quantity)
+        added, of_gap = solve.offset, self.thicker.get
+        if solve.quantity == "thickness":
+            added += of_gap(solve.surface, 0.0)
+        if solve.address_of_source[1] == "thickness":
+            added -= solve.scale * of_gap(solve.source, 0.0)
         named = {"quantity_of_source": "" if new is not None and quantity == new[1] else quantity}
-        return {"source": surface, "scale": sign * solve.scale * of_source, "offset": sign * solve.offset} | named
+        return {"source": surface, "scale": sign * solve.scale * of_source, "offset": sign * added} | named
 
     def _of_operand(self, rule: Rule, operands: Sequence[int | None]) -> Rule | None:
         """A rule of a number of the configurations."""
@@ -275,7 +289,9 @@ class Numbering:
                 break
             for k in more:
                 moved[k] = None
-        self.lost += [f"row {k} {row.name} {_numbers(row)}" for k, row in enumerate(rows, 1) if k in gone]
+        self.lost.extend(
+            f"row {k} {row.name} {row.integers[0]} {row.integers[1]}" for k, row in enumerate(rows, 1) if k in gone
+        )
         places = {k: k - sum(other < k for other in gone) for k in range(len(rows) + 1) if k not in gone}
         return tuple(_with_rows(row, places) for row in moved if row is not None)
 
@@ -358,6 +374,46 @@ class Numbering:
 _TURNED_PIVOTS = {0: 1, 1: 0, 2: 3, 3: 2}
 
 
+def _backwards(variables: tuple[Vary, ...], solves: tuple[Solve, ...]) -> tuple[tuple[Vary, ...], tuple[Solve, ...]]:
+    """Variables and solves in which pickups follow surfaces in front of them, as in files, where that is possible.
+
+    y = s x + o of a surface behind is x = y/s - o/s: y is the variable then, and what followed x follows y.
+    """
+    solved = {solve.address for solve in solves}
+    ahead = [
+        solve
+        for solve in solves
+        if solve.kind == "pickup"
+        and solve.operand is None
+        and solve.scale
+        and solve.source > solve.surface
+        and not solve.quantity_of_source
+        and solve.quantity != "glass"
+        and solve.address_of_source not in solved
+    ]
+    if not ahead:
+        return variables, solves
+    first = min(ahead, key=lambda solve: solve.surface)
+    x, scale, offset = first.address_of_source, first.scale, first.offset
+
+    def followed(solve: Solve) -> Solve:
+        if solve is first:
+            back = {"scale": 1 / scale, "offset": 0.0 - offset / scale}
+            return replace(solve, surface=solve.source, source=solve.surface, **back)
+        if solve.kind != "pickup" or solve.operand is not None or solve.address_of_source != x:
+            return solve
+        times = solve.scale / scale
+        return replace(solve, source=first.surface, scale=times, offset=solve.offset - times * offset)
+
+    def varied(variable: Vary) -> Vary:
+        if variable.operand is not None or variable.address != x:
+            return variable
+        bounds = tuple(sorted(scale * end + offset for end in variable.bounds))
+        return replace(variable, surface=first.surface, bounds=bounds)
+
+    return _backwards(tuple(map(varied, variables)), tuple(map(followed, solves)))
+
+
 def _takes(row: Row) -> set[int]:
     """The numbers of the rows whose values a row takes."""
     kinds = ARGUMENTS.get(row.operand, ("", "")) if isinstance(row.operand, str) else ("", "")
@@ -377,7 +433,3 @@ def _with_rows(row: Row, places: dict[int, int]) -> Row:
         return row
     kept = [places[k] for k in range(min(first, last), max(first, last) + 1) if k in places]
     return replace(row, integers=(min(kept), max(kept))) if kept else row
-
-
-def _numbers(row: Row) -> str:
-    return " ".join(map(str, row.integers))

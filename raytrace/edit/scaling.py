@@ -43,24 +43,29 @@ def scale(lens: Lens, factor: Tensor | float | None = None, *, efl: Tensor | flo
         raise BadEdit(f"scale: give {option('factor')} or {option('efl')}, one of the two")
     if efl is not None:
         now = first_order(lens).effective_focal_length
-        if not math.isfinite(float(now)) or float(now) * float(efl) <= 0:
-            raise BadEdit(f"{option('efl', f'{float(efl):g}')}: the lens has an EFL of {float(now):g} mm")
         factor = efl / now
-    assert factor is not None
-    if not 0 < float(factor) < math.inf:
-        raise BadEdit(f"scale by {float(factor):g}: expected a factor above 0; to turn the lens around: reverse")
-    by = factor if varies(factor) else float(factor)
+        if not 0 < _plain(factor) < math.inf:
+            raise BadEdit(f"{option('efl', f'{_plain(efl):g}')}: the lens has an EFL of {_plain(now):g} mm")
+    size = _plain(factor)
+    if not 0 < size < math.inf:
+        raise BadEdit(f"scale by {size:g}: expected a factor above 0; to turn the lens around: reverse")
+    by = factor if varies(factor) else size
     unscaled: list[str] = []
     operands = tuple(_operand(operand, lens, by) for operand in lens.operands)
     data = lens.optimization_data
     new = dataclasses.replace(
         scaled(lens, by),
         operands=operands,
-        optimization_data=None if data is None else _data(data, lens, float(factor), unscaled),
-        name=lens.name and f"{lens.name}, scaled by {float(factor):.6g}",
+        optimization_data=None if data is None else _data(data, lens, size, unscaled),
+        name=lens.name and f"{lens.name}, scaled by {size:.6g}",
     )
     warn_of(LeftAsItWas, "scale: of an unknown unit, and left as they were", unscaled)
     return new
+
+
+def _plain(number: Tensor | float | None) -> float:
+    """A number without its derivatives; nan of None."""
+    return math.nan if number is None else float(number.detach() if isinstance(number, Tensor) else number)
 
 
 def _operand(operand: Operand, lens: Lens, factor: Tensor | float) -> Operand:
@@ -79,7 +84,7 @@ def _operand(operand: Operand, lens: Lens, factor: Tensor | float) -> Operand:
     # the first path holds factor · number + offset
     first = powers[0]
     paths = tuple(
-        ScaledPath(path, scale * float(factor) ** (power - first), offset * float(factor) ** power)
+        ScaledPath(path, scale * _plain(factor) ** (power - first), offset * _plain(factor) ** power)
         for (path, scale, offset), power in zip(operand.paths, powers, strict=True)
     )
     finite = torch.isfinite(operand.numbers)

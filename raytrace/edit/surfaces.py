@@ -64,10 +64,10 @@ def delete(lens: Lens, surfaces: At) -> Lens:
     """The lens without some surfaces: one, those of an element as "3-4", of a comment. All others stay in their places.
 
     The gap in their place has the thickness of all gaps that it joins, and is air if air is on one of its sides. Its
-    variables and solves are those of the gap behind if that has a solve or leads to the image, or if the gap before has
-    none. A stop among the surfaces stays, as a plane. What refers to a deleted surface is left out, in one warning
-    (`LeftOut`): variables, solves, pickups, operands of configurations, merit rows and tolerances. Raises BadEdit for
-    the object, the image, a mirror, and all surfaces of a lens.
+    solve or variable is that of the gap before or behind that has one, a solve rather than a variable. A stop among the
+    surfaces stays, as a plane. What refers to a deleted surface is left out, in one warning (`LeftOut`): variables,
+    solves, pickups, operands of configurations, merit rows and tolerances. Raises BadEdit for the object, the image, a
+    mirror, and all surfaces of a lens.
     """
     first, last = surfaces_at(lens, surfaces)
     where = f"delete {first}-{last}" if last > first else f"delete {first}"
@@ -115,7 +115,10 @@ def without(lens: Lens, first: int, last: int, rules: Sequence[Vary | Solve] | N
     gaps[first - 1] = None
     for place, gap in enumerate(kept):
         gaps[gap] = first - 1 + place
-    numbering = Numbering(lens, tuple(numbers), tuple(gaps))
+    grown = zip(kept, thicknesses, strict=True)
+    thicker = {gap: float((thickness - lens.surfaces[gap].thickness).detach()) for gap, thickness in grown if gap}
+    outer_gaps = {first - 1: first - 1, last: first - 1 + has_stop}
+    numbering = Numbering(lens, tuple(numbers), tuple(gaps), joined=outer_gaps, thicker=thicker)
     operands: list[Operand | None] = list(lens.operands)
     for gap, together in zip(kept, joined, strict=True):
         operands = _joined_operands(lens, operands, gap, together)
@@ -128,14 +131,15 @@ def _sum(numbers: Iterable[Tensor]) -> Tensor:
 
 
 def _gap_kept(lens: Lens, joined: range, rules: Sequence[Vary | Solve]) -> int:
-    """The gap, the first or the last of those that are joined, whose variable or solve is that of the gap in their
-    place."""
+    """The first or the last of the gaps that are joined, whose variable or solve is that of the gap in their place."""
     first, last = joined[0], joined[-1]
-    if first == 0:
-        return 0
-    varied = {rule.surface for rule in rules if isinstance(rule, Vary) and rule.quantity == "thickness"}
-    solved = {rule.surface for rule in rules if isinstance(rule, Solve) and rule.quantity == "thickness"}
-    return last if last == sensor(lens) or last in solved or first not in varied | solved else first
+    ranks = {first: 0, last: 0}
+    for rule in rules:
+        if rule.quantity == "thickness" and rule.operand is None and rule.surface in ranks:
+            ranks[rule.surface] = max(ranks[rule.surface], 1 + isinstance(rule, Solve))
+    if first == 0 or ranks[first] > ranks[last]:
+        return first
+    return last if ranks[last] > ranks[first] or last == sensor(lens) else first
 
 
 def _joined_operands(lens: Lens, operands: Sequence[Operand | None], kept: int, joined: range) -> list[Operand | None]:
@@ -213,12 +217,14 @@ def split(
         return with_meniscus(lens, first)
     k = _element(lens, (first, last), "split")
     front, share_of = lens.surfaces[k], as_tensor(share, dtype=lens.wavelengths.dtype)
-    if not 0 < float(share_of) < 1:
-        raise BadEdit(f"split {k}-{k + 1}: {option('share', f'{float(share_of):g}')}: expected a part between 0 and 1")
+    if not 0 < float(share_of.detach()) < 1:
+        raise BadEdit(
+            f"split {k}-{k + 1}: {option('share', f'{float(share_of.detach()):g}')}: expected a part between 0 and 1"
+        )
     like = front.thickness
     bend, air = (like.new_tensor(n) if not isinstance(n, Tensor) else n for n in (curvature, gap))
-    if float(air) < 0:
-        raise BadEdit(f"split {k}-{k + 1}: {option('gap', f'{float(air):g}')}: expected 0 mm or more")
+    if float(air.detach()) < 0:
+        raise BadEdit(f"split {k}-{k + 1}: {option('gap', f'{float(air.detach()):g}')}: expected 0 mm or more")
     medium, n = _medium_before(lens, k), media(lens, lens.primary)
     before, glass, behind = n[k - 1], n[k], n[k + 1]
     parts = share_of * like, (1 - share_of) * like
@@ -278,8 +284,10 @@ def bend(lens: Lens, element: At, shape: Tensor | float, *, keep: str = "efl") -
     linear = 0.5 * (steps[0] * (x + 1) + steps[1] * (x - 1))
     square = -0.25 * depth * steps[0] * steps[1] * (x * x - 1)
     radicand = linear * linear + 4 * square * wanted
-    if not float(radicand) > 0:
-        raise BadEdit(f"bend {k}-{k + 1}: no element of the shape {float(x):g} has its power and its thickness")
+    if not float(radicand.detach()) > 0:
+        raise BadEdit(
+            f"bend {k}-{k + 1}: no element of the shape {float(x.detach()):g} has its power and its thickness"
+        )
     size = 2 * wanted / (linear + torch.copysign(torch.sqrt(radicand), linear))
     new = lens
     for number, (surface, old, sign) in enumerate(((front, c[0], 1), (back, c[1], -1)), k):

@@ -141,7 +141,7 @@ def _coefficients(surface: Surface) -> Tensor | None:
     a, kind = surface.coefficients, KINDS[surface.kind]
     if a is None:
         return None
-    return _with_signs(a, [-1 if kind.power_of(entry) else 1 for entry in range(len(a))])
+    return _with_signs(a, [1 if kind.name_of(entry).startswith("conic") else -1 for entry in range(len(a))])
 
 
 def _with_signs(numbers: Tensor, signs: Sequence[int]) -> Tensor:

@@ -223,7 +223,8 @@ def scaled(part: Any, factor: Tensor | float, power: int | list[int] = 0) -> Any
             before, by = getattr(part, field.name), POWERS.get(type(part).__name__, {}).get(field.name, 0)
             after = scaled(before, factor, by(part) if callable(by) else by)
             if after is not before:
-                changes[field.name] = float(after) if field.name == "semi_diameter" else after
+                is_plain = field.name == "semi_diameter" and isinstance(after, Tensor)
+                changes[field.name] = float(after.detach()) if is_plain else after
         return dataclasses.replace(part, **changes) if changes else part
     if not isinstance(part, Tensor | float) or not power:
         return part
