@@ -54,9 +54,9 @@ class Numbering:
     """The new numbers of the surfaces of a lens.
 
     lens: before the edit; surfaces, gaps: (S,) the new number of each, None where it is gone; turned: the surfaces that
-    are turned around, with `turn`. joined: the new number of a gap that is part of another, for rows, which may name
-    one gap twice; thicker: mm by which a gap has grown, by its old number. lost: the names of all that is left out,
-    which `with_surfaces` fills.
+    are turned around, with `turn`. joined: the new number of a gap that is part of another, for rows and tolerances;
+    thicker: mm by which a gap has grown, by its old number. lost: the names of all that is left out, which
+    `with_surfaces` fills.
     """
 
     lens: Lens
@@ -321,15 +321,19 @@ class Numbering:
     def lines(self, lines: Sequence[str], operands: Sequence[int | None] = ()) -> tuple[str, ...]:
         """The lines of tolerances by their new numbers; those of surfaces that are gone are left out."""
         pivot = 0
+        of_gaps: set[tuple] = set()
 
         def moved(line: ToleranceLine) -> list[ToleranceLine]:
             nonlocal pivot
             if line.name == "MPVT":
                 pivot = line.integers[0]
             integers = self._integers(line, operands)
-            if integers is None:
+            # of a gap that joins two, one line of each name is left
+            is_of_joined = line.arguments[0] == "gap" and line.integers[0] in self.joined
+            if integers is None or (is_of_joined and (line.name, integers) in of_gaps):
                 self.lost.append(f"tolerance {line}")
                 return []
+            of_gaps.update([(line.name, integers)] if is_of_joined else [])
             new = replace(line, integers=integers)
             if line.arguments[0] not in ("surface", "element") or line.integers[0] not in self.turned:
                 return [new]
@@ -348,8 +352,8 @@ class Numbering:
         if kind == "operand":
             number = operands[first - 1] if 1 <= first <= len(operands) else first - 1
             return None if number is None else (number + 1, second, third)
-        numbers = self.gaps if kind == "gap" else self.surfaces
-        if not kind or not 0 <= first < len(numbers):
+        numbers = dict(enumerate(self.gaps)) | self.joined if kind == "gap" else dict(enumerate(self.surfaces))
+        if not kind or first not in numbers:
             return line.integers
         if kind == "element":
             ends = self.ends(first, min(second or first, len(numbers) - 1))
@@ -360,7 +364,7 @@ class Numbering:
         new = numbers[first]
         if new is None:
             return None
-        if other == "gap" and 0 <= second < len(numbers):
+        if other == "gap" and second in numbers:
             adjuster = numbers[second]
             second = new if adjuster is None else adjuster
         return new, second, third

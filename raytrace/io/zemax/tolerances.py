@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 from raytrace.io.source import LensFileError, Place, Record, is_number, plain
 from raytrace.io.zemax.surfaces import in_millimetres, type_of, types
-from raytrace.system.configurations import Path, count
+from raytrace.system.configurations import count
 from raytrace.system.dimensions import power_at
 from raytrace.system.lens import Lens
 from raytrace.system.parameter_paths import modelled, path_of
@@ -460,8 +460,11 @@ class ToleranceLine:
             held = lens.operands[number - 1] if 1 <= number <= len(lens.operands) else None
             return power_at(lens, held.paths[0].path) if held is not None and held.paths else None
         if self.name in ("TPAR", "CPAR", "COMP") or self.name in _BREAKS:
-            name = self.quantity(lens)
-            return None if name is None else power_at(lens, ("surfaces", self.integers[0], *_steps(lens, self, name)))
+            name, k = self.quantity(lens), self.integers[0]
+            if name is None or not 0 <= k < len(lens.surfaces):
+                return None
+            surface = modelled(lens.surfaces[k], name)
+            return power_at(surface, path_of(surface, name).steps)
         if self.name in _ROLLS or self.name in _RADIAL:
             return 0 if self.name in ("TARX", "TARY", "TARR") else 1
         kind = _TERMS.get(self.name, (_KINDS.get(self.name, ""),))[0]
@@ -479,10 +482,6 @@ class ToleranceLine:
             return None
         place = _Reader(lens)._name(Record(self.name, self.words, "", Place("tolerance line")))
         return None if place is None else place[1]
-
-
-def _steps(lens: Lens, line: ToleranceLine, name: str) -> Path:
-    return path_of(modelled(lens.surfaces[line.integers[0]], name), name).steps
 
 
 def rewritten(lines: Sequence[str], change: Callable[[ToleranceLine], Sequence[ToleranceLine]]) -> tuple[str, ...]:
