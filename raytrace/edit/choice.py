@@ -30,19 +30,19 @@ def warn_of(category: type[RaytraceWarning], words: str, names: Sequence[str]) -
         warnings.warn(f"{words}: {'; '.join(names)}", category, stacklevel=calling_level())
 
 
-def surfaces_at(lens: Lens, at: At) -> tuple[int, int]:
+def surfaces_at(lens: Lens, choice: At) -> tuple[int, int]:
     """The first and the last surface of a choice: numbers, "3-6", or a comment in any case.
 
     Of a comment on one surface that begins a cemented group, or an element, they are those of the group or the element,
     as in files of vendors; of a comment on several surfaces, the first and the last of these. Raises BadEdit.
     """
     last = len(lens.surfaces) - 1
-    if isinstance(at, str) and (match := re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+))?\s*", at)):
+    if isinstance(choice, str) and (match := re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+))?\s*", choice)):
         ends = int(match[1]), int(match[2] or match[1])
-    elif isinstance(at, str):
-        return _of_comment(lens, at)
+    elif isinstance(choice, str):
+        return _of_comment(lens, choice)
     else:
-        numbers = [at] if isinstance(at, int) else [int(number) for number in at]
+        numbers = [choice] if isinstance(choice, int) else [int(number) for number in choice]
         if not numbers:
             raise BadEdit("no surface is chosen; expected a number, the first and the last one, or a comment")
         ends = numbers[0], numbers[-1]

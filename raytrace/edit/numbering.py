@@ -255,8 +255,8 @@ class Numbering:
             added += of_gap(solve.surface, 0.0)
         if solve.address_of_source[1] == "thickness":
             added -= solve.scale * of_gap(solve.source, 0.0)
-        named = {"quantity_of_source": "" if new is not None and quantity == new[1] else quantity}
-        return {"source": surface, "scale": sign * solve.scale * of_source, "offset": sign * added} | named
+        of_other = {"quantity_of_source": "" if new is not None and quantity == new[1] else quantity}
+        return {"source": surface, "scale": sign * solve.scale * of_source, "offset": sign * added} | of_other
 
     def _of_operand(self, rule: Rule, operands: Sequence[int | None]) -> Rule | None:
         """A rule of a number of the configurations."""
@@ -340,8 +340,8 @@ class Numbering:
             new = new.negated() if line.sign(self.lens, self._sign_of) < 0 else new
             if not line.has_pivot or pivot == _TURNED_PIVOTS.get(pivot, pivot):
                 return [new]
-            there, back = (ToleranceLine("MPVT", (code, 0, 0)) for code in (_TURNED_PIVOTS[pivot], pivot))
-            return [there, new, back]
+            before, behind = (ToleranceLine("MPVT", (code, 0, 0)) for code in (_TURNED_PIVOTS[pivot], pivot))
+            return [before, new, behind]
 
         return rewritten(lines, moved)
 

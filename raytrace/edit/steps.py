@@ -58,21 +58,21 @@ def edited(lens: Lens, steps: Sequence[Step]) -> Edited:
 
     A step "at" chooses the surfaces of the steps behind it that name none. Raises BadEdit.
     """
-    now, at = lens, ""
+    now, chosen = lens, ""
     for name, words in steps:
         if name == "at":
             surfaces_at(now, words)
-            at = words
+            chosen = words
         else:
-            now = STEPS[name](now, words, at)
+            now = STEPS[name](now, words, chosen)
     return Edited(lens, now)
 
 
-def _chosen(words: Sequence[str], at: str, name: str, further: int = 0) -> tuple[str, list[str], dict[str, Any]]:
+def _chosen(words: Sequence[str], chosen: str, name: str, further: int = 0) -> tuple[str, list[str], dict[str, Any]]:
     """The surfaces of a step, its further words, and its settings NAME=VALUE. Raises BadEdit."""
     settings = dict(word.split("=", 1) for word in words if "=" in word)
     plain = [word for word in words if "=" not in word]
-    surfaces = plain.pop(0) if len(plain) > further else at
+    surfaces = plain.pop(0) if len(plain) > further else chosen
     if not surfaces:
         raise BadEdit(f"{option(name)}: no surfaces; give numbers as 3-4, a comment, or {option('at')} before it")
     if len(plain) != further:
@@ -95,47 +95,53 @@ def _known(settings: Mapping[str, Any], known: Sequence[str], name: str) -> dict
     return dict(settings)
 
 
-def _insert(lens: Lens, words: Sequence[str], at: str) -> Lens:
+def _insert(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     rows = [word for word in words if "=" in word]
-    surfaces, _, _ = _chosen([word for word in words if "=" not in word], at, "insert")
+    surfaces, _, _ = _chosen([word for word in words if "=" not in word], chosen, "insert")
     made = [{key: _value(text) for key, _, text in (cell.partition("=") for cell in row.split(","))} for row in rows]
     made = [{"thickness": 0.0} | row for row in made]
     return insert(lens, surfaces, made) if made else insert(lens, surfaces)
 
 
-def _split(lens: Lens, words: Sequence[str], at: str) -> Lens:
-    surfaces, _, settings = _chosen(words, at, "split")
+def _reverse(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    return reverse(lens, _chosen(words, chosen, "reverse")[0] if words or chosen else None)
+
+
+def _split(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, _, settings = _chosen(words, chosen, "split")
     return split(lens, surfaces, **_known(settings, ("share", "gap", "curvature"), "split"))
 
 
-def _bend(lens: Lens, words: Sequence[str], at: str) -> Lens:
-    surfaces, (shape,), settings = _chosen(words, at, "bend", 1)
+def _bend(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, (shape,), settings = _chosen(words, chosen, "bend", 1)
     factor = _value(shape)
     if isinstance(factor, str):
         raise BadEdit(f"{option('bend')} {shape!r}: expected a shape factor, as 0.5")
     return bend(lens, surfaces, factor, **_known(settings, ("keep",), "bend"))
 
 
-def _comment(lens: Lens, words: Sequence[str], at: str) -> Lens:
-    surfaces, text = (at, words[0]) if len(words) == 1 and at else (words[0], " ".join(words[1:]))
+def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, text = (chosen, words[0]) if len(words) == 1 and chosen else (words[0], " ".join(words[1:]))
     return rename(lens, comments={surfaces: text})
 
 
 def _of_surfaces(edit: Callable[[Lens, At], Lens], name: str) -> Callable[[Lens, Sequence[str], str], Lens]:
-    return lambda lens, words, at: edit(lens, _chosen(words, at, name)[0])
+    return lambda lens, words, chosen: edit(lens, _chosen(words, chosen, name)[0])
 
 
 #: The edits by the names of their options: lens, words, surfaces of "at" -> lens.
 STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
-    "scale": lambda lens, factor, at: scale(lens, factor),
-    "efl": lambda lens, efl, at: scale(lens, efl=efl),
-    "reverse": lambda lens, words, at: reverse(lens, _chosen(words, at, "reverse")[0] if words or at else None),
-    "swap_conjugates": lambda lens, words, at: reverse(lens, swap_conjugates=True),
+    "scale": lambda lens, factor, chosen: scale(lens, factor),
+    "efl": lambda lens, efl, chosen: scale(lens, efl=efl),
+    "reverse": lambda lens, words, chosen: reverse(
+        lens, _chosen(words, chosen, "reverse")[0] if words or chosen else None
+    ),
+    "swap_conjugates": lambda lens, words, chosen: reverse(lens, swap_conjugates=True),
     "insert": _insert,
     "delete": _of_surfaces(delete, "delete"),
     "join": _of_surfaces(join, "join"),
     "split": _split,
     "bend": _bend,
-    "rename": lambda lens, title, at: rename(lens, title),
+    "rename": lambda lens, title, chosen: rename(lens, title),
     "comment": _comment,
 }

@@ -328,7 +328,7 @@ def rename(lens: Lens, title: str | None = None, *, comments: Mapping[int | str,
     A comment of several surfaces, "3-4", is that of the first. Raises BadEdit.
     """
     surfaces = list(lens.surfaces)
-    for at, comment in (comments or {}).items():
-        k, _ = surfaces_at(lens, at)
+    for choice, comment in (comments or {}).items():
+        k, _ = surfaces_at(lens, choice)
         surfaces[k] = dataclasses.replace(surfaces[k], comment=comment)
     return dataclasses.replace(lens, name=lens.name if title is None else title, surfaces=tuple(surfaces))
