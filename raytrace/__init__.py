@@ -41,6 +41,15 @@ PUBLIC = {
     "write_lens": "io",
     "with_object_distance": "system.lens",
     "with_sensor_distance": "system.lens",
+    # edits
+    "scale": "edit.scaling",
+    "reverse": "edit.turning",
+    "insert": "edit.surfaces",
+    "delete": "edit.surfaces",
+    "join": "edit.surfaces",
+    "split": "edit.surfaces",
+    "bend": "edit.surfaces",
+    "rename": "edit.surfaces",
     # media
     "AIR": "materials.glass",
     "MIRROR": "materials.glass",
@@ -99,9 +108,9 @@ PUBLIC = {
     "Compensator": "system.tolerance_data",
     "Tolerance": "system.tolerance_data",
     "ToleranceTable": "tolerancing.table",
-    "cemented_groups": "tolerancing.elements",
+    "cemented_groups": "tolerancing.grades",
     "draw_errors": "tolerancing.sampling",
-    "lens_elements": "tolerancing.elements",
+    "lens_elements": "tolerancing.grades",
     "perturbed": "tolerancing.perturbation",
     "read_tolerances": "tolerancing.files",
     "ToleranceAnalysis": "tolerancing.analysis",
@@ -187,6 +196,7 @@ ERRORS = {
     "AmbiguousGlass": "materials.catalogs",
     "ArrayError": "maths.arrays",
     "BadCheckpoint": "optimization.checkpoint",
+    "BadEdit": "edit.choice",
     "BadHold": "optimization.variables",
     "BadLimits": "system.parameter_paths",
     "BadMerit": "optimization.merit",
@@ -217,6 +227,8 @@ ERRORS = {
     "ImplausibleWavelength": "materials.glass",
     "Incomplete": "analysis.setting",
     "InvalidIndex": "materials.glass",
+    "LeftAsItWas": "edit.choice",
+    "LeftOut": "edit.choice",
     "LensFileError": "io.source",
     "LensFileWarning": "io.source",
     "LostRays": "tracing.ray_failures",
@@ -278,7 +290,7 @@ TOP = (
 )
 #: Packages whose public names are typed with them.
 NAMESPACES = (
-    *("system", "io", "materials", "maths", "tracing", "analysis", "psf_models", "optimization", "tolerancing"),
+    *("system", "io", "edit", "materials", "maths", "tracing", "analysis", "psf_models", "optimization", "tolerancing"),
     *("imaging", "wave_optics"),
 )
 #: Names of older versions that changed, and their names now.

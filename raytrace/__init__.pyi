@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from raytrace import analysis as analysis
+from raytrace import edit as edit
 from raytrace import imaging as imaging
 from raytrace import io as io
 from raytrace import materials as materials
@@ -43,6 +44,9 @@ from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong
 from raytrace.cli.runner import CommandError as CommandError
 from raytrace.cli.settings import BadSettings as BadSettings
+from raytrace.edit.choice import BadEdit as BadEdit
+from raytrace.edit.choice import LeftAsItWas as LeftAsItWas
+from raytrace.edit.choice import LeftOut as LeftOut
 from raytrace.files import NotWritten as NotWritten
 from raytrace.imaging import Camera as Camera
 from raytrace.imaging import Variables as Variables

@@ -247,9 +247,11 @@ class Kind:
         return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
 
     def power_of(self, entry: int) -> int:
-        """The power of length of a coefficient, counted from 0."""
-        name = self.name_of(entry)
-        return {"curvature_x": -1, "conic_x": 0}[name] if entry < len(self.heads) else 1 - int(name[1:])
+        """The power of length in a coefficient, counted from 0."""
+        heads = len(self.heads)
+        if entry < heads:
+            return -1 if self.heads[entry].startswith("curvature") else 0
+        return 1 - self.step * (entry - heads + 1)
 
     @property
     def powers(self) -> str:
