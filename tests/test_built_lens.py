@@ -22,7 +22,7 @@ from raytrace.shards import Share
 from raytrace.system.tolerance_data import Compensator
 from raytrace.tolerancing import grades
 
-SMALL = CodesignSettings(depth=2, width=2, patch=8, size=7, epochs=2, batch=4, crops=2, cameras=2)
+SMALL = CodesignSettings(optimizer="adam", depth=2, width=2, patch=8, size=7, epochs=2, batch=4, crops=2, cameras=2)
 BUILT = dataclasses.replace(SMALL, as_built=True, grade="commercial", vary="sensor curvature:1,10")
 DISTANCES = torch.tensor([12e3, 20e3, 45e3], dtype=torch.float64)
 

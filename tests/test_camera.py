@@ -54,7 +54,7 @@ from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.wave_optics.element import phase_element
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
-SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
+SMALL = CodesignSettings(optimizer="adam", depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
 MICROMETRE = 1e-3
 COLOUR = Sensor(size=(24, 16), pixels=(240, 160), response="rgb", mosaic="RGGB", full_well=1e3, read_noise=2, bits=8)
 NOISY = Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1, saturation=math.inf)

@@ -29,7 +29,9 @@ from raytrace.tracing.spot import image_rays
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"
-SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2, vary=SPACES, hold="efl")
+SMALL = CodesignSettings(
+    optimizer="adam", depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2, vary=SPACES, hold="efl"
+)
 
 
 def moved(variables, **by):
