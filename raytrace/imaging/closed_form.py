@@ -67,6 +67,7 @@ def camera_error(
     columns) the filter of each field is joint, `joint_wiener`. draw: of an element alone, generator of errors of
     fabrication. Round elements whose sampling is fixed (`Camera.plan`) need an eighth of the frequencies (`octant`).
     """
+    _refuse_aliases(camera)
     spectrum = spectrum.to(camera.fields.device)
     sigma = camera.sensor.noise_deviation(spectrum)
     haze = camera.normalise == "haze"
@@ -93,6 +94,7 @@ def field_filters(
     places: (N,) shares of the way from the middle of the sensor to its corner; distances: (Z,) mm, by default evenly
     over the camera's range; spectrum: (C, rows, columns) of the scene.
     """
+    _refuse_aliases(camera)
     distances = even_distances(camera) if distances is None else distances
     spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
@@ -100,6 +102,11 @@ def field_filters(
     if spectrum.dim() == 4:
         return joint_wiener(transfer, spectrum, camera.sensor.noise_deviation(spectrum))
     return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), camera.sensor.noise_deviation(spectrum))
+
+
+def _refuse_aliases(camera: Camera) -> None:
+    if camera.oversampling > 1:
+        raise ValueError(f"a camera with oversampling {camera.oversampling}: the error here has no aliases; expected 1")
 
 
 def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:
@@ -263,7 +270,7 @@ def out_of_focus(camera: Camera[Variables]) -> str:
 
 def _in_focus(camera: Camera[Variables]) -> tuple[float, float]:
     """Sensor distances in mm at which an object of the range is in focus to the width of the PSF."""
-    width = camera.sensor.pitch * camera.size
+    width = camera.picture_sensor.pitch * camera.size
     return sensor_range(camera.variables(), camera.range, fields=camera.fields, width=width)
 
 
