@@ -254,14 +254,17 @@ class Growth:
                 bar.update(int(number <= len(steps)))
                 bar.set_postfix_str(f"step {number}: merit {result.merit:.6g}")
             if not np.isfinite(result.merit) or result.lost:
-                return self._end(minimum, step, f"failing rays in {result.lost:g} rows")
+                self._end(minimum, step, f"failing rays in {result.lost:g} rows")
+                return None
             if not waiting and repeats < _REPEATS and worse_between(task.model.lens_at(result.x)):
                 waiting.append(replace(step, fields=2 * step.fields - 1, rings=step.rings + _MORE_RINGS))
                 repeats += 1
             if not waiting:
                 break
-        end = Minimum(result, minimum.task, seconds, minimum.descents)
-        return (task, end) if result.is_valid else self._end(minimum, step, "a condition is not met")
+        if not result.is_valid:
+            self._end(minimum, step, "a condition is not met")
+            return None
+        return task, Minimum(result, minimum.task, seconds, minimum.descents)
 
     def _end(self, minimum: Minimum, step: Step, reason: str) -> None:
         """Note why the steps from a minimum ended."""
