@@ -159,6 +159,8 @@ def test_files_bring_variables_and_their_bounds_back(triplet, tmp_path, suffix):
     }
     found = rt.optimize(path, merit=SPOT, cycles=3)
     assert efl(found.lens) == pytest.approx(100, rel=1e-6)
+    assert [row.name for row in found.lens.optimization_data.merit].count("TRAC") == len(SPOT.rows(lens)) - 2
+    assert rt.optimize(found.lens, cycles=1).merit_before == pytest.approx(found.merit_after, rel=1e-6)
 
 
 @pytest.mark.needs(SHARED / "merit" / "dev")

@@ -393,9 +393,9 @@ def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
         return Condition(_free(in_unit(row, unit, 1.0)), operand.bounds or "=", before=primary)
     taken = _taken(rows, k)
     if operand.bounds:  # OPLT, ABGT …
-        source, size, of = rows[taken[0] - 1], row.name.startswith("AB"), configurations_of(rows, 0)
+        source, size, configured = rows[taken[0] - 1], row.name.startswith("AB"), configurations_of(rows, 0)
         plain = OPERANDS[source.operand].refers is None and OPERANDS[source.operand].bounds in ("", operand.bounds)
-        if plain and not (size or primary) and of[k - 1] == of[taken[0] - 1]:
+        if plain and not (size or primary) and configured[k - 1] == configured[taken[0] - 1]:
             held = dataclasses.replace(source, target=row.target, weight=0.0)
             return Condition(in_unit(held, unit, 1.0), operand.bounds)
         row = Row("ABSO" if size else "OPVA", row.integers, target=row.target)
