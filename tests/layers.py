@@ -27,6 +27,7 @@ FLOORS = {
     "io": 4,
     # computations
     "tracing": 5,
+    "edit": 6,
     "psf_models": 6,
     "analysis": 7,
     "wave_optics": 7,

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.edit.surfaces import without
 from raytrace.materials.glass import is_air
 from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.curriculum import Growth, Plan, Step
@@ -23,7 +24,7 @@ from raytrace.optimization.one_element import thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.removal import Removal, without_element
+from raytrace.optimization.removal import Removal
 from raytrace.optimization.saddle_points import Place, enlarged, saddle
 from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
@@ -323,7 +324,7 @@ def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
     x = np.clip(removal._whole.model.start, stage.lower, stage.upper)
     thin, reduced = removal._whole.model.lens_at(x), removal.reduced
     assert [surface.glass.name for surface in reduced.model.lens.surfaces].count("SK4") == 2
-    assert torch.allclose(rt.spot(without_element(thin, 3)).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
+    assert torch.allclose(rt.spot(without(thin, 3, 4)[0]).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
     assert len(reduced.model.variables) == len(asked.model.variables) - 4
     assert reduced.whole.merit(reduced.whole.evaluated(removal._without(x)), removal._without(x)) == pytest.approx(
         stage.problem.merit(stage.problem.evaluated(x), x), rel=1e-9
@@ -332,10 +333,10 @@ def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
 
 def test_the_stop_and_the_image_keep_their_places(best_triplet):
     _, lens = best_triplet
-    assert (lens.stop, without_element(lens, 6).stop, without_element(lens, 1).stop) == (5, 5, 3)
+    assert (lens.stop, without(lens, 6, 7)[0].stop, without(lens, 1, 2)[0].stop) == (5, 5, 3)
     for k in (1, 3, 6):
         total = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
-        shorter = sum(float(surface.thickness) for surface in without_element(lens, k).surfaces[1:-1])
+        shorter = sum(float(surface.thickness) for surface in without(lens, k, k + 1)[0].surfaces[1:-1])
         gone = sum(float(surface.thickness) for surface in lens.surfaces[1:3]) if k == 1 else 0.0
         assert shorter == pytest.approx(total - gone, rel=1e-12)
 

@@ -16,4 +16,5 @@ from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.rms import rms_over_field as rms_over_field
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.spot_diagram import spot as spot
+from raytrace.analysis.thermal import thermal as thermal
 from raytrace.analysis.wavefronts import wavefront as wavefront

@@ -34,6 +34,7 @@ from raytrace.cli.options import (
     switch,
 )
 from raytrace.cli.types import (
+    Reader,
     count,
     count_or_all,
     count_or_none,
@@ -117,6 +118,35 @@ _WAVE_FIGURES = {
     "encircled": "the fraction of the light within a radius",
 }
 
+
+class Step(argparse.Action):
+    """An edit: its name and its words are appended to `steps`, in the order of the command line."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, word: str | None = None
+    ) -> None:
+        namespace.steps = [*getattr(namespace, "steps", ()), (self.dest, values)]
+
+
+#: The edits of `raytrace edit`: name, reader, metavar, count of words, help.
+EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, str], ...] = (
+    ("at", None, "SURFACES", None, "the surfaces of the edits behind it that name none"),
+    ("scale", positive_finite, "FACTOR", None, "all lengths, and all that depends on them, by a factor"),
+    ("efl", finite, "MM", None, "scale to an effective focal length"),
+    ("reverse", None, "SURFACES", "*", "turn the lens around, or a group of surfaces; object and image stay"),
+    ("swap_conjugates", None, "", 0, "turn the lens around with object and image: rays are traced backwards"),
+    ("insert", None, "BEFORE ROW", "+", "surfaces before one, a row each, as radius=50,thickness=4,glass=N-BK7; "
+     "without a row a plane"),
+    ("delete", None, "SURFACES", "*", "take surfaces out; all others stay in their places"),
+    ("join", None, "SURFACES", "*", "take out surfaces that do nothing, and add the thicknesses"),
+    ("split", None, "SURFACES", "*", "cut an element into two of the same power together: share=0.5 of the thickness, "
+     "gap=0 mm, curvature=0 of the first face; of one surface: a meniscus without thickness before it"),
+    ("bend", None, "SURFACES X", "+", "the element of the shape factor X and the same power; keep=thin: its power "
+     "without thickness"),
+    ("rename", None, "TITLE", None, "the title"),
+    ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
+)  # fmt: skip
+
 #: Subcommands of `raytrace wave`.
 WAVE_COMMANDS = (
     _command(
@@ -187,6 +217,35 @@ COMMANDS = (
         Option("target", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", flag="target"),
         "catalog", "json", row("strict", "fail on anything unknown or assumed in IN"), "configuration", "substitute",
         "max_bytes", run="cli.runs:convert",
+    ),
+    _command(
+        "edit",
+        "scale, reverse, split, bend, insert and delete",
+        """\
+Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
+have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
+is the element, or the cemented group, that begins there.
+
+Stop, solves, pickups, configurations, merit rows and tolerances follow with their numbers; what refers to a surface
+that is gone is left out and named in a warning. Focal length, track and F-number before and after are printed.""",
+        """
+        double_gauss --scale 2 -o large.zmx
+        cooke_triplet --efl 50 --rename "Cooke triplet 50 mm" -o triplet50.zmx
+        cooke_triplet --reverse -o reversed.zmx
+        double_gauss --reverse 3-5 -o flipped.zmx
+        relay.zmx --swap-conjugates -o backwards.zmx
+        cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
+        lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
+        lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
+        lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx""",
+        *LENS,
+        group(
+            "edits, in the order given",
+            *(Option(name, reader, metavar, help, nargs=nargs, action=Step)
+              for name, reader, metavar, nargs, help in EDITS),
+        ),
+        Option("output", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", "-o --output",
+               required=True), run="cli.runs:edit",
     ),
     _command(
         "layout",
@@ -685,6 +744,21 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         singlet --wavelength 0.45 0.65 --json""",
         *LENS, CONDITIONS, plot("the curve"), TABLE,
         row("samples", "wavelengths of the curve", default=101),
+    ),
+    _command(
+        "thermal",
+        "focus, focal length, spot and MTF over temperature",
+        "Focal length, back focal distance, focus shift, RMS spot radius and the lowest MTF of all fields over "
+        "temperature, with the sensor fixed in the mount, by default aluminium, and refocused.",
+        """
+        double_gauss --range -20 60 --mount aluminium --plot thermal.png
+        cemented_achromat --mount invar --modulation-frequency 40 --json
+        lens.zmx --range -40 85 --samples 6 --mount 12.5 -o thermal.csv""",
+        *LENS, CONDITIONS, plot("focus shift, spot and MTF"), TABLE, "fields",
+        Option("temperatures", finite, ("LOW", "HIGH"), "lowest and highest temperature, °C (default -20 60)",
+            flag="--range", nargs=2),
+        row("samples", "temperatures", default=9),
+        Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
     ),
     _command(
         "distortion-grid",

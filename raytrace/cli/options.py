@@ -107,9 +107,11 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("ray_aiming", help="aim rays at the stop: not at all, over a stop as wide as the paraxial or the real "
            "marginal ray makes it, or auto: real where the axis bends in front of the stop, else off (default: as the "
            "file specifies, else auto)", choices=("auto", "off", "paraxial", "real")),
-    Option("temperature", finite, "C", "of the glasses and the air, °C; with one of the two the other is the file's, "
-           "or 20 °C, 1 atm"),
+    Option("temperature", finite, "C", "of the lens and the air, °C: indices change, glasses and spacers expand; with "
+           "one of the two the other is the file's, or 20 °C, 1 atm"),
     Option("pressure", not_negative, "ATM", "of the air, atm; 0 in vacuum"),
+    Option("mount", None, "MATERIAL", "of all spaces without a stated expansion: aluminium, titanium, invar, "
+           "stainless-304 …, or its expansion in 1e-6/K (default: spacers keep their length)"),
     # field and pupil
     Option("fields", field_point, "F", "field points, Y or X,Y, in the file's own kind of field (degrees or mm), "
            "never an index; vignetting factors are interpolated between the file's own fields", flag="--field",
@@ -179,7 +181,7 @@ def object_distance(several: str) -> Option:
 
 def conditions(several: str = "several: one result after the other") -> Adder:
     """Conditions other than those of the file."""
-    surroundings = ("wavelengths", "ray_aiming", "temperature", "pressure")
+    surroundings = ("wavelengths", "ray_aiming", "temperature", "pressure", "mount")
     distances = (object_distance(several), "sensor_distance")
     return group("conditions other than the file's", *distances, APERTURE, *surroundings)
 

@@ -40,6 +40,24 @@ def convert(arguments: argparse.Namespace) -> Result:
     return raytrace.convert(**options, catalogs=catalogs(arguments))
 
 
+def edit(arguments: argparse.Namespace) -> Result:
+    """The edits of a lens in their order; the lens is written."""
+    from raytrace.edit.steps import edited  # loads the package of edits
+
+    steps = getattr(arguments, "steps", [])
+    if not steps:
+        raise CommandError("no edit is given, such as --scale 2, --reverse, --delete 3-4")
+    try:
+        result = edited(open_lens(arguments), steps)
+    except ValueError as error:
+        raise CommandError(f"{arguments.lens}: {error}") from error
+    with printed_on_failure(result, arguments):
+        write_lens(result.lens, arguments.output, catalogs=catalogs(arguments))
+    say(f"written: {arguments.output}")
+    arguments.output = None
+    return result
+
+
 def layout(arguments: argparse.Namespace) -> Result:
     """The layout, drawn in a file of this folder by default."""
     arguments.plot = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"

@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from raytrace.optimization.conditions import Condition, surface_arguments
+from raytrace.edit.numbering import Numbering
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.search_tasks import (
@@ -109,21 +110,14 @@ def _family(task: SearchProblem) -> tuple:
 # -- rows of a lens of other surfaces ----------------------------------------------------------------------------------
 
 
-def renumbered(rows: Sequence[Row], number: Callable[[int], int]) -> tuple[Row, ...]:
-    """Rows that name the same surfaces by their new numbers."""
-    return tuple(
-        replace(row, integers=(number(row.integers[0]) if first else row.integers[0],
-                               number(row.integers[1]) if second else row.integers[1]))
-        for row in rows
-        for first, second in [surface_arguments(row)]
-    )  # fmt: skip
-
-
-def conditions_renumbered(conditions: Sequence[Condition], number: Callable[[int], int]) -> tuple[Condition, ...]:
+def conditions_renumbered(conditions: Sequence[Condition], numbering: Numbering) -> tuple[Condition, ...]:
     """Conditions whose rows name the same surfaces by their new numbers."""
-    rows = renumbered([condition.row for condition in conditions], number)
-    before = (renumbered(condition.before, number) for condition in conditions)
-    return tuple(replace(c, row=row, before=b) for c, row, b in zip(conditions, rows, before, strict=True))
+    moved = ((condition, numbering.rows((*condition.before, condition.row))) for condition in conditions)
+    return tuple(
+        replace(condition, row=rows[-1], before=rows[:-1])
+        for condition, rows in moved
+        if len(rows) == len(condition.before) + 1
+    )
 
 
 def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Row, ...]:

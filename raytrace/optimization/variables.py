@@ -303,12 +303,16 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 
 
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
-    """The variable of a number of a surface; where it differs between configurations, a variable for each of them."""
+    """The variable of a number of a surface; where it differs between configurations, a variable for each of them that
+    does not follow another by expansion."""
+    rules = () if lens.optimization_data is None else lens.optimization_data.solves
+    expanding = {(rule.operand, rule.configuration) for rule in rules if rule.kind == "thermal"}
     for position, operand in enumerate(lens.operands):
         addresses = [address for address, _ in addresses_of(lens, operand)]
         if operand.numbers is not None and (k, quantity) in addresses:
             first = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # the others follow it
-            return [Vary(*first, number, position) for number in range(1, len(operand.numbers) + 1)]
+            numbers = range(1, len(operand.numbers) + 1)
+            return [Vary(*first, number, position) for number in numbers if (position, number) not in expanding]
     return [Vary(k, quantity)]
 
 

@@ -13,7 +13,8 @@
 | rays              | Rays: positions, directions, validity, optical path                                        |
 | configurations    | the configurations of a zoom or multi-configuration lens                                   |
 | parameter_paths   | numbers of a lens by name                                                                  |
-| optimization_data | variables, solves, pickups and merit function of a file; dimensions: units of its operands |
+| optimization_data | variables, solves, pickups and merit function of a file; dimensions: powers of length      |
+| elements          | elements and cemented groups, found from the media and mirrors                             |
 | prescription      | `rt.lens`: a lens from rows of plain numbers                                               |
 | identity          | digest of a lens in the files that store numbers for it                                    |
 

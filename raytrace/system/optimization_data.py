@@ -63,6 +63,7 @@ class Solve:
     "power": the curvature by which the surface has the power numbers[0], in 1/mm.
     "focal_length": the curvature, or thickness, with which the lens has the effective focal length numbers[0] mm.
 
+    "thermal", between configurations: it follows its number in configuration `source` by expansion.
     "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
 
     All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):

@@ -246,6 +246,13 @@ class Kind:
         heads = len(self.heads)
         return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
 
+    def power_of(self, entry: int) -> int:
+        """The power of length in a coefficient, counted from 0."""
+        heads = len(self.heads)
+        if entry < heads:
+            return -1 if self.heads[entry].startswith("curvature") else 0
+        return 1 - self.step * (entry - heads + 1)
+
     @property
     def powers(self) -> str:
         """The powers of r that a file holds, in words."""

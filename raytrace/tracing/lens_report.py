@@ -184,6 +184,7 @@ class Info(Result):
                     "semi_diameter": number(surface.semi_diameter),
                     "comment": surface.comment,
                     **_environment(surface),
+                    **({} if surface.expansion is None else {"expansion": number(surface.expansion)}),
                 }
                 for k, surface in enumerate(lens.surfaces)
             ],
@@ -316,5 +317,7 @@ def _remarks(lens: Lens, k: int) -> str:
         parts.append(f"light does not enter {unused}")
     if surface.environment is not None:
         parts.append(f"in {environment_in_words(surface.environment)}")
+    if surface.expansion is not None:
+        parts.append(f"expansion {float(surface.expansion):g}e-6/K")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))

@@ -191,6 +191,9 @@ def _surface(
         "  STO" if number == lens.stop else "",
         f"  SLB {label}" if label else "",
         f"  {COMMENT.lower()} break" if surface.is_break else "",
+        f"  {COMMENT.lower()} expansion {exact(surface.expansion, 'thermal expansion', place)}"
+        if surface.expansion is not None
+        else "",
         *_poses(surface, place),
         *_shape(surface, place),
         *([] if radial is None else _phase(radial, float(lens.primary), place)),

@@ -215,6 +215,7 @@ def _surface(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Seq
             _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
         ),
         environment=environment_of(cells, place) if environment else None,
+        expansion=None if (stated := _cell(row, "expansion")) is None else double(stated),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
 

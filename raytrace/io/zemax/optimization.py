@@ -366,7 +366,7 @@ def read(
         if not all(map(math.isfinite, (*solve.numbers, solve.scale, solve.offset))):
             message = f"a solve of the {solve.quantity}: a number is too large once converted to mm"
             raise LensFileError(message, surfaces[min(solve.surface, len(surfaces) - 1)].block.place)
-    kept = tuple(solve for solve in solves if not _is_followed(solve))
+    kept = tuple(solve for solve in solves if not _is_followed(solve, lens))
     for solve in kept:
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
     lines = [record for record in sections.tail if record.keyword in TOLERANCES]  # also behind the configurations
@@ -381,7 +381,7 @@ def read(
     )
     data = OptimizationData(
         variables,
-        tuple(solve for solve in solves if _is_followed(solve)),
+        tuple(solve for solve in solves if _is_followed(solve, lens)),
         merit,
         unit=millimetres if merit or tolerances or configured else 1.0,
         tolerances=tuple(tolerances),
@@ -397,7 +397,9 @@ def read(
     return dataclasses.replace(lens, optimization_data=None if data == OptimizationData(semi_diameters=sized) else data)
 
 
-def _is_followed(solve: Solve) -> bool:
+def _is_followed(solve: Solve, lens: Lens) -> bool:
+    if solve.kind == "thermal":
+        return lens.environment is not None and bool(re.fullmatch(r"thickness|curvature|a\d+", solve.quantity))
     if solve.operand is None:
         return solve.quantity != "semi_diameter" and solve.kind in _FOLLOWED
     # a pickup between configurations: of a quantity whose unit is known, or that needs none
