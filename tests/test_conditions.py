@@ -42,12 +42,13 @@ def test_conditions_are_rows_that_opticstudio_reads(triplet):
     assert triplet.conditions == ()
     assert in_words(lens) == WORDS
     rows = [(row.name, row.integers, row.target, row.weight, row.text) for row in lens.optimization_data.merit]
-    assert rows[:5] == [
+    assert rows[:6] == [
         ("EFFL", (0, 0), 100.0, -1.0, ""),
         ("TOTR", (0, 0), 0.0, 0.0, ""),
         ("OPLT", (2, 0), 200.0, -1.0, ""),
         ("MNEG", (1, 7), 1.0, -1.0, ""),
-        ("BLNK", (0, 0), 0.0, 0.0, "off:distortion<=2%"),
+        ("BLNK", (0, 0), 0.0, 0.0, "off:"),
+        ("DIMX", (0, 0), 2.0, 0.0, ""),
     ]
     limits = triplet.with_conditions("air_thickness>=0.5 air_thickness<=50 air_edge>=0.4 glass_thickness>=2")
     assert [row.name for row in limits.optimization_data.merit] == ["MNCA", "MXCA", "MNEA", "MNCG"]
@@ -63,7 +64,19 @@ def test_a_condition_replaces_those_of_its_quantity_and_side(triplet):
     off = [dataclasses.replace(condition, on=False) for condition in lens.conditions]
     switched = lens.with_conditions(off, only=True)
     assert in_words(switched) == "off:thickness:2<=20 off:efl=100 off:thickness:2>=5"
-    assert switched.optimization_data.merit[0] == Row("BLNK", text="off:thickness:2<=20")
+    assert [row.name for row in switched.optimization_data.merit] == [
+        *("BLNK", "TTHI", "OPLT", "BLNK", "EFFL", "BLNK", "TTHI", "OPGT")
+    ]
+    assert all(row.weight == 0 for row in switched.optimization_data.merit)
+    assert in_words(switched.with_conditions("efl=90")) == "off:thickness:2<=20 off:thickness:2>=5 efl=90"
+
+
+def test_edits_renumber_and_scale_conditions(triplet):
+    lens = triplet.with_conditions("efl=100 total_track<=200 edge>=1 off:thickness:6>=2 distortion<=2%")
+    larger = rt.edit.scale(lens, 2.0)
+    assert in_words(larger) == "efl=200 total_track<=400 edge>=2 off:thickness:6>=4 distortion<=2%"
+    fewer = rt.edit.delete(lens, "1-2")
+    assert in_words(fewer) == "efl=100 total_track<=200 edge>=1 off:thickness:4>=2 distortion<=2%"
 
 
 def test_rows_of_negative_weight_are_conditions_also_of_other_rows(triplet):
@@ -159,6 +172,8 @@ def test_files_bring_variables_and_their_bounds_back(triplet, tmp_path, suffix):
     }
     found = rt.optimize(path, merit=SPOT, cycles=3)
     assert efl(found.lens) == pytest.approx(100, rel=1e-6)
+    assert [row.name for row in found.lens.optimization_data.merit].count("TRAC") == len(SPOT.rows(lens)) - 2
+    assert rt.optimize(found.lens, cycles=1).merit_before == pytest.approx(found.merit_after, rel=1e-6)
 
 
 @pytest.mark.needs(SHARED / "merit" / "dev")

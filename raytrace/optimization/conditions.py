@@ -6,8 +6,8 @@ operand by its arguments. A name alone, as "efl", keeps the number of the lens a
 become larger. A condition with "off:" in front is stored, and not met.
 
 A lens stores its conditions where OpticStudio does, in its merit function: a row of negative weight is met exactly,
-as a limit on one side if its operand is one (MNCG, OPLT of another row), else as an equality. A condition that is off
-is a row of text, "BLNK off:efl=50".
+as a limit on one side if its operand is one (MNCG, OPLT of another row), else as an equality. The rows of a condition
+that is off have the weight 0 and follow a row of text, "BLNK off:".
 """
 
 import dataclasses
@@ -314,6 +314,7 @@ def with_conditions(lens: Lens, conditions: str | Sequence[str | Condition], *, 
     old, current = [*_of_rows(lens, data.merit, data.unit, checked=False)], lens.current_configuration
     same = {c for _, c in old if c in new}
     gone = {k for k, c in old if c not in same and (only or any(other.excludes(c, current) for other in new))}
+    gone |= {text for k, text in _off_rows(data.merit).items() if k in gone}
     rows = list(without_rows(data.merit, gone))
     for condition in new:
         if condition not in same:
@@ -368,21 +369,26 @@ def _of_rows(lens: Lens, rows: Sequence[Row], unit: float, *, checked: bool = Tr
     checked: raise BadHold for a surface that the lens does not have.
     """
     configurations = configurations_of(rows, lens.current_configuration)
-    several = any(row.operand == "CONF" for row in rows)
+    several, off = any(row.operand == "CONF" for row in rows), _off_rows(rows)
     for k, row in enumerate(rows, 1):
-        if row.operand == "BLNK" and row.text.startswith(OFF):
-            try:
-                condition = _condition(lens, row.text)
-            except BadHold:  # a text of another kind, or of a surface that is gone
-                continue
-            yield k, condition
-        elif row.weight < 0 and row.operand in OPERANDS:
+        is_off = k in off
+        if row.operand in OPERANDS and (row.weight < 0 or is_off):
             condition = _of_row(rows, k, unit)
             if several and not any(other.operand == "CONF" for other in condition.before):
                 condition = dataclasses.replace(condition, configuration=configurations[k - 1])
             if checked:
                 _check_surfaces(lens, condition, k)
-            yield k, dataclasses.replace(condition, name=_name(lens, condition, k))
+            yield k, dataclasses.replace(condition, name=_name(lens, condition, k), on=not is_off)
+
+
+def _off_rows(rows: Sequence[Row]) -> dict[int, int]:
+    """The rows of conditions that are off, from 1, and the row of text above each."""
+    off = {}
+    for k, row in enumerate(rows, 1):
+        if row.operand == "BLNK" and row.text == OFF and k < len(rows) and not rows[k].weight:
+            sided = k + 1 < len(rows) and not rows[k + 1].weight and _taken(rows, k + 2) == [k + 1]
+            off[k + 2 if sided else k + 1] = k
+    return off
 
 
 def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
@@ -390,12 +396,14 @@ def _of_row(rows: Sequence[Row], k: int, unit: float) -> Condition:
     row, operand = rows[k - 1], OPERANDS[rows[k - 1].operand]
     primary = tuple(row for row in rows[:k] if row.operand == "PRIM")[-1:]
     if operand.refers is None:
+        if row.operand in BOUNDARIES and row.name[:2] in ("MN", "MX"):  # from the object means from surface 1
+            row = dataclasses.replace(row, integers=(max(row.integers[0], 1), row.integers[1]))
         return Condition(_free(in_unit(row, unit, 1.0)), operand.bounds or "=", before=primary)
     taken = _taken(rows, k)
     if operand.bounds:  # OPLT, ABGT …
-        source, size, of = rows[taken[0] - 1], row.name.startswith("AB"), configurations_of(rows, 0)
+        source, size, configured = rows[taken[0] - 1], row.name.startswith("AB"), configurations_of(rows, 0)
         plain = OPERANDS[source.operand].refers is None and OPERANDS[source.operand].bounds in ("", operand.bounds)
-        if plain and not (size or primary) and of[k - 1] == of[taken[0] - 1]:
+        if plain and not (size or primary) and configured[k - 1] == configured[taken[0] - 1]:
             held = dataclasses.replace(source, target=row.target, weight=0.0)
             return Condition(in_unit(held, unit, 1.0), operand.bounds)
         row = Row("ABSO" if size else "OPVA", row.integers, target=row.target)
@@ -496,11 +504,8 @@ def _taken(rows: Sequence[Row], k: int) -> list[int]:
 
 def _rows_of(condition: Condition, lens: Lens, above: Sequence[Row], unit: float) -> Iterator[Row]:
     """The rows of a condition below the rows `above`, in the unit of the file. Raises BadHold."""
-    if not condition.on:
-        if not condition.is_worded:
-            raise BadHold(f"{condition.quantity} has no words in a file: it cannot be off; leave it out")
-        yield Row("BLNK", text=str(condition))
-        return
+    if not (condition.on or condition.is_worded):
+        raise BadHold(f"{condition.quantity} takes values of other rows: it cannot be off; leave it out")
     current, row = lens.current_configuration, in_unit(condition.row, 1.0, unit)
     wanted, start = condition.configuration or current, len(above)
     if configurations_of(above, current)[-1:] not in ([], [wanted]) or (not above and wanted != current):
@@ -510,17 +515,21 @@ def _rows_of(condition: Condition, lens: Lens, above: Sequence[Row], unit: float
     if last_primary != lens.primary_wavelength:
         yield Row("PRIM", (0, lens.primary_wavelength))
         start += 1
+    if not condition.on:
+        yield Row("BLNK", text=OFF)
+        start += 1
     for other in condition.before:
         yield rereferenced(other, lambda n: n + start)
     start += len(condition.before)
     if condition.before:
         row = rereferenced(row, lambda n: n + start - len(condition.before))
+    weight = -1.0 if condition.on else 0.0
     if condition.relation == "=" or OPERANDS[row.operand].bounds:
-        yield dataclasses.replace(row, weight=-1.0)
+        yield dataclasses.replace(row, weight=weight)
         return
     sided = {"<=": "LT", ">=": "GT"}[condition.relation]
     if row.operand in ("OPVA", "ABSO"):
         yield Row(f"{'AB' if row.operand == 'ABSO' else 'OP'}{sided}", row.integers, target=row.target, weight=-1.0)
         return
     yield dataclasses.replace(row, target=0.0, weight=0.0)
-    yield Row(f"OP{sided}", (start + 1, 0), target=row.target, weight=-1.0)
+    yield Row(f"OP{sided}", (start + 1, 0), target=row.target, weight=weight)

@@ -26,7 +26,7 @@ from raytrace.maths.numerics import Dual, Number, slope_of, value_of
 from raytrace.optimization.conditions import Condition, has_other_rows, stored_conditions, with_conditions
 from raytrace.optimization.least_squares import Sides, SumOfSquares
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, Ray, View
-from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, rereferenced
+from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, in_unit, rereferenced
 from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import DesignVariables
@@ -352,25 +352,29 @@ class FunctionMerit:
 def optimization_data_of(
     model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition] = ()
 ) -> OptimizationData:
-    """Optimisation data of an optimised lens: those of its file, or of this optimisation where that has none but
-    conditions, with the conditions of both, in mm, and with rows that follow those of the file, as boundaries.
+    """Optimisation data of an optimised lens: those of its file, and what that lacks of this optimisation: variables,
+    solves, rows of the merit function, boundaries that follow the rows of the file, and conditions, in mm.
 
     Semi-diameters that a lens without any data has stay specified.
     """
     lens, data = model.lens, model.lens.optimization_data
-    given = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
-    if data is None or not (data.rules or data.tolerances or has_other_rows(lens)):
-        given, of_lens = given if data is None else data.semi_diameters, stored_conditions(lens)
-        data = OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
-        lens = with_conditions(dataclasses.replace(lens, optimization_data=data), of_lens)
+    if data is None:
+        data = OptimizationData(semi_diameters=tuple(k for k, s in enumerate(lens.surfaces) if s.semi_diameter))
+    of_lens, length = stored_conditions(lens), data.unit if data.rules or data.tolerances else unit
+    if has_other_rows(lens):
+        free = [dataclasses.replace(row, weight=0.0) if row.weight < 0 else row for row in data.merit]
+        is_extended, length = [*rows[: len(free)]] == free, data.unit
+        merit = (*data.merit, *(rows[len(free) :] if is_extended else ()))
     else:
-        count, free = (
-            len(data.merit),
-            [dataclasses.replace(row, weight=0.0) if row.weight < 0 else row for row in data.merit],
-        )
-        further = tuple(rows[count:]) if [*rows[:count]] == free else ()
-        data = dataclasses.replace(data, variables=data.variables or model.variables, merit=(*data.merit, *further))
-        lens = dataclasses.replace(lens, optimization_data=data)
+        merit = tuple(in_unit(row, unit, length) for row in rows)
+    data = dataclasses.replace(
+        data,
+        variables=data.variables or model.variables,
+        solves=data.solves or model.solves,
+        merit=merit,
+        unit=length,
+    )
+    lens = with_conditions(dataclasses.replace(lens, optimization_data=data), of_lens)
     return with_conditions(lens, conditions).optimization_data or data
 
 
