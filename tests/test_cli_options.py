@@ -49,7 +49,7 @@ DIFFERENT = {
     "--depth": "layers of a network, distances of points, and a map",
     "--sensor": "its distance from an element, and its size",
     **dict.fromkeys(
-        ("--insert", "--delete"), "search tries elements at surfaces, edit takes surfaces or rows of one lens"
+        ("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"
     ),
 }
 
