@@ -13,15 +13,16 @@ from torch.testing import assert_close
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.edit.scaling import scale
-from raytrace.edit.turning import turned
+from raytrace.edit.turning import _TURNED, turned
 from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.configurations import differences
-from raytrace.system.dimensions import ARGUMENTS, DIMENSION, scaled
+from raytrace.system.dimensions import ARGUMENTS, DIMENSION, POWERS, scaled
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
-from raytrace.system.phases import FringePhase, Hologram, PolynomialPhase, added_path
+from raytrace.system.phases import PHASES, FringePhase, Hologram, PolynomialPhase, added_path
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import (
+    SAG_TERMS,
     FringeSag,
     GridSag,
     IrregularSag,
@@ -31,6 +32,7 @@ from raytrace.system.sag_terms import (
     ZernikeSag,
     spline,
 )
+from raytrace.system.shapes import HEADS, KINDS
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tolerancing.files import tolerances_of
 from raytrace.tracing.trace import rays_at
@@ -471,6 +473,13 @@ def test_derivatives_by_the_shape_are_those_of_differences():
 
 
 # -- tables, files and the command -------------------------------------------------------------------------------------
+
+
+def test_every_kind_is_scaled_and_turned():
+    """A new kind of sag or phase has its powers of length, and its turned numbers."""
+    assert {*SAG_TERMS, *PHASES} <= {*POWERS}
+    assert {*SAG_TERMS, *PHASES} <= {*_TURNED}
+    assert {head for kind in KINDS.values() for head in kind.heads} <= {*HEADS}
 
 
 def test_rows_number_what_the_operands_take():

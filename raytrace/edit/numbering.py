@@ -135,7 +135,7 @@ class Numbering:
 
     def ends(self, first: int, last: int, *, of_gaps: bool = False) -> tuple[int, int] | None:
         """The ends of a range of surfaces, or gaps, of a row by their new numbers; None where all are gone."""
-        numbers = dict(enumerate(self.gaps)) | self.joined if of_gaps else dict(enumerate(self.surfaces))
+        numbers = {**dict(enumerate(self.gaps)), **self.joined} if of_gaps else dict(enumerate(self.surfaces))
         new = (numbers[k] for k in range(min(first, last), max(first, last) + 1))
         kept = [number for number in new if number is not None]
         return (min(kept), max(kept)) if kept else None
@@ -352,7 +352,7 @@ class Numbering:
         if kind == "operand":
             number = operands[first - 1] if 1 <= first <= len(operands) else first - 1
             return None if number is None else (number + 1, second, third)
-        numbers = dict(enumerate(self.gaps)) | self.joined if kind == "gap" else dict(enumerate(self.surfaces))
+        numbers = {**dict(enumerate(self.gaps)), **self.joined} if kind == "gap" else dict(enumerate(self.surfaces))
         if not kind or first not in numbers:
             return line.integers
         if kind == "element":
@@ -402,7 +402,7 @@ def _backwards(variables: tuple[Vary, ...], solves: tuple[Solve, ...]) -> tuple[
 
     def followed(solve: Solve) -> Solve:
         if solve is first:
-            back = {"scale": 1 / scale, "offset": 0.0 - offset / scale}
+            back: dict[str, Any] = {"scale": 1 / scale, "offset": 0.0 - offset / scale}
             return replace(solve, surface=solve.source, source=solve.surface, **back)
         if solve.kind != "pickup" or solve.operand is not None or solve.address_of_source != x:
             return solve

@@ -6,6 +6,7 @@ Its wavefront errors are the factor times as many waves.
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,7 +50,7 @@ def scale(lens: Lens, factor: Tensor | float | None = None, *, efl: Tensor | flo
     size = _plain(factor)
     if not 0 < size < math.inf:
         raise BadEdit(f"scale by {size:g}: expected a factor above 0; to turn the lens around: reverse")
-    by = factor if varies(factor) else size
+    by: Any = factor if varies(factor) else size
     unscaled: list[str] = []
     operands = tuple(_operand(operand, lens, by) for operand in lens.operands)
     data = lens.optimization_data

@@ -45,7 +45,7 @@ class Edited(Result):
     def tables(self) -> list[Table]:
         before, after = self.figures(self.before), self.figures(self.lens)
         quantities = ["effective focal length, mm", "total track, mm", "F/#", "surfaces", "stop"]
-        columns = {
+        columns: dict[Any, Sequence] = {
             Column("quantity", form="<", heading=" "): quantities,
             Column("before", form=".9g"): [*before.values()],
             Column("after", form=".9g"): [*after.values()],
@@ -99,7 +99,7 @@ def _insert(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     rows = [word for word in words if "=" in word]
     surfaces, _, _ = _chosen([word for word in words if "=" not in word], chosen, "insert")
     made = [{key: _value(text) for key, _, text in (cell.partition("=") for cell in row.split(","))} for row in rows]
-    made = [{"thickness": 0.0} | row for row in made]
+    made = [{"thickness": 0.0, **row} for row in made]
     return insert(lens, surfaces, made) if made else insert(lens, surfaces)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ def insert(lens: Lens, before: At, rows: Iterable[Mapping] = ({"thickness": 0.0}
     rows = [dict(row) for row in rows]
     new = [
         dataclasses.replace(
-            prescription.surface({"glass": medium.glass} | row, k + number, lens.catalogs),
+            prescription.surface({"glass": medium.glass, **row}, k + number, lens.catalogs),
             environment=None if "glass" in row else medium.environment,
         )
         for number, row in enumerate(rows)
@@ -94,7 +95,7 @@ def without(lens: Lens, first: int, last: int, rules: Sequence[Vary | Solve] | N
         rules = () if lens.optimization_data is None else lens.optimization_data.rules
     outer = _medium_before(lens, first), lens.surfaces[medium_surfaces(lens.surfaces)[last]]
     medium = next((surface for surface in outer if is_air(surface.glass)), outer[0])
-    behind = {"glass": medium.glass, "environment": medium.environment}
+    behind: dict[str, Any] = {"glass": medium.glass, "environment": medium.environment}
     before = lens.surfaces[first - 1]
     if not same(medium.glass, outer[0].glass):
         before = dataclasses.replace(before, **behind)
@@ -106,7 +107,7 @@ def without(lens: Lens, first: int, last: int, rules: Sequence[Vary | Solve] | N
     new = [dataclasses.replace(before, thickness=thicknesses[0])]
     if has_stop:
         stop = lens.surfaces[lens.stop]
-        kept_of_stop = {name: getattr(stop, name) for name in ("semi_diameter", "comment", "apertures")}
+        kept_of_stop: dict[str, Any] = {name: getattr(stop, name) for name in ("semi_diameter", "comment", "apertures")}
         new.append(Surface(thicknesses[1], **kept_of_stop, **behind))
     surfaces = (*lens.surfaces[: first - 1], *new, *lens.surfaces[last + 1 :])
     fewer = len(lens.surfaces) - len(surfaces)
@@ -144,22 +145,22 @@ def _gap_kept(lens: Lens, joined: range, rules: Sequence[Vary | Solve]) -> int:
 
 def _joined_operands(lens: Lens, operands: Sequence[Operand | None], kept: int, joined: range) -> list[Operand | None]:
     """The operands of the configurations, with one thickness of the gap that joins others: their sum."""
-    result, of_gaps = list(operands), {}
+    result = list(operands)
+    of_gaps: dict[Any, int] = {}
     for k, operand in enumerate(operands):
         path = operand.paths[0].path if operand is not None and operand.paths else ()
         if path[:1] == ("surfaces",) and path[2:] == ("thickness",) and path[1] in joined:
             of_gaps[path[1]] = k
     if not of_gaps:
         return result
-    sums = _sum(
-        lens.operands[of_gaps[gap]].numbers if gap in of_gaps else lens.surfaces[gap].thickness for gap in joined
-    )
+    differing: dict[Any, Any] = {gap: lens.operands[k].numbers for gap, k in of_gaps.items()}
+    sums = _sum(differing.get(gap, lens.surfaces[gap].thickness) for gap in joined)
     place = of_gaps.get(kept, min(of_gaps.values()))
     for k in of_gaps.values():
         result[k] = None
-    path = ScaledPath(("surfaces", kept, "thickness"))
+    joint = ScaledPath(("surfaces", kept, "thickness"))
     further = lens.operands[place].paths[1:]
-    result[place] = dataclasses.replace(lens.operands[place], number=kept, paths=(path, *further), numbers=sums)
+    result[place] = dataclasses.replace(lens.operands[place], number=kept, paths=(joint, *further), numbers=sums)
     return result
 
 
@@ -229,10 +230,10 @@ def split(
     before, glass, behind = n[k - 1], n[k], n[k + 1]
     parts = share_of * like, (1 - share_of) * like
     bends = vertex_curvature(front), vertex_curvature(lens.surfaces[k + 1])
-    strengths = [(glass - before) * bends[0], (before - glass) * bend, None, (behind - glass) * bends[1]]
+    strengths = [(glass - before) * bends[0], (before - glass) * bend, (behind - glass) * bends[1]]
     gaps = [parts[0] / glass, air / before, parts[1] / glass]
-    whole = _power([strengths[0], strengths[3]], [like / glass])
-    trials = [_power([*strengths[:2], (glass - before) * x, strengths[3]], gaps) for x in (0.0, 1.0)]
+    whole = _power([strengths[0], strengths[2]], [like / glass])
+    trials = [_power([*strengths[:2], (glass - before) * x, strengths[2]], gaps) for x in (0.0, 1.0)]
     other = (whole - trials[0]) / (trials[1] - trials[0]) if isinstance(gap, Tensor) or gap else bend
     faces = [
         Surface(air, bend, glass=medium.glass, environment=medium.environment, semi_diameter=front.semi_diameter),

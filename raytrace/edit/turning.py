@@ -141,7 +141,7 @@ def _coefficients(surface: Surface) -> Tensor | None:
     a, kind = surface.coefficients, KINDS[surface.kind]
     if a is None:
         return None
-    return _with_signs(a, [1 if kind.name_of(entry).startswith("conic") else -1 for entry in range(len(a))])
+    return _with_signs(a, [kind.sign_of(entry) for entry in range(len(a))])
 
 
 def _with_signs(numbers: Tensor, signs: Sequence[int]) -> Tensor:
@@ -203,7 +203,7 @@ def _hologram(part: Any) -> dict[str, Any]:
     return {name: _with_signs(point, (-1, 1, -1)) for name, point in (("first", part.second), ("second", part.first))}
 
 
-#: The numbers of sag terms and phases that change, by their class; those of the others stay.
+#: The numbers of sag terms and phases that change, by their class.
 _TURNED: dict[str, Callable[[Any], dict[str, Any]]] = {
     "GridSag": lambda sag: {"heights": _negative(sag.heights.flip(1))},
     "SplineSag": lambda sag: {"coefficients": _negative(sag.coefficients.flip(1))},
@@ -221,9 +221,9 @@ _TURNED: dict[str, Callable[[Any], dict[str, Any]]] = {
     "Hologram": _hologram,
     "HologramPath": _hologram,
     "IdealLens": lambda lens: {"vergence": None},  # which is that of the whole lens
+    **dict.fromkeys(("Grating", "RadialPhase", "RadialPath", "Facets"), lambda phase: {}),
 }
 
 
 def _part(part: Any) -> Any:
-    change = None if part is None else _TURNED.get(type(part).__name__)
-    return part if change is None else dataclasses.replace(part, **change(part))
+    return None if part is None else dataclasses.replace(part, **_TURNED[type(part).__name__](part))

@@ -24,7 +24,9 @@ To add:
   (`code=None`: torch alone);
 - sag terms: a value and its functions in `sag_terms`, a row of SAG_TERMS;
 - an aperture: its edges in `apertures`, a row of SHAPES, and its lines in tracing/cpp/apertures.h;
-- a phase: a value and its path in `phases`, a row of PHASES.
+- a phase: a value and its path in `phases`, a row of PHASES;
+- of all of them: the powers of length of their numbers, a row of `dimensions.POWERS` or `shapes.HEADS`, and their
+  numbers on a surface that is turned around, a row of `edit.turning`.
 
 Tests: tests/test_MODULE.py; test_shapes adds a kind of each to the tables; test_asphere and test_freeform (sags),
 test_compiled_sags and test_compiled_poses (against the compiled trace), test_hardcases (extreme numbers).

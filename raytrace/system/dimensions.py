@@ -172,7 +172,7 @@ _LENGTHS_OF_PATH: dict[str, Power] = {
 _TERMS: dict[str, Power] = {"coefficients": 1, "radius": 1}
 _POINTS: dict[str, Power] = {"first": 1, "second": 1}
 
-#: Power of length of every number of a lens that has one, by class and field.
+#: Power of length of every number of a lens that has one, by class and field; a class without a row is not scaled.
 POWERS: dict[str, dict[str, Power]] = {
     "Surface": {"thickness": 1, "curvature": -1, "coefficients": _of_coefficients, "semi_diameter": 1},
     "Aperture": {"extent": 1, "centre": 1},
@@ -192,6 +192,7 @@ POWERS: dict[str, dict[str, Power]] = {
     "RadialPath": {"coefficients": lambda path: [1 - 2 * j for j in range(1, len(path.coefficients) + 1)]},
     "SystemAperture": {"value": lambda a: int(a.kind in ("entrance_pupil_diameter", "float_by_stop"))},
     "Fields": {"x": _of_fields, "y": _of_fields},
+    **{name: {} for name in ("Lens", "Operand", "Environment", "Glass", "Grating", "Facets", "TiltSag")},
 }
 
 
@@ -229,6 +230,7 @@ def scaled(part: Any, factor: Tensor | float, power: int | list[int] = 0) -> Any
     if not isinstance(part, Tensor | float) or not power:
         return part
     if isinstance(power, list):
+        assert isinstance(part, Tensor), "entries have their powers"
         return torch.stack([_times(number, factor, exponent) for number, exponent in zip(part, power, strict=True)])
     is_infinite = is_any(part.isinf()) if isinstance(part, Tensor) else math.isinf(part)
     return part if is_infinite else _times(part, factor, power)
