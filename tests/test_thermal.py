@@ -63,12 +63,12 @@ def test_the_analysis_is_a_table_a_figure_and_a_document(shown, tmp_path):
 
 def test_the_command_prints_the_analysis(command):
     code, out, err = command(
-        *("thermal", "singlet", "--range", -10, 40, "--mount", "titanium", "--samples", 2),
-        *("--modulation-frequency", 5, "--json"),
+        *("thermal", "cemented_achromat", "--range", -10, 40, "--mount", "titanium", "--samples", 2, "--json"),
+        *("--modulation-frequency", 20, "--field", 0, "--wavelength", 0.5876),
     )
     assert code == 0, err
     document = json.loads(out)
-    assert (document["mount_expansion"], document["frequency"]) == (8.6, 5.0)
+    assert (document["mount_expansion"], document["frequency"]) == (8.6, 20.0)
 
 
 def test_a_range_and_a_mount_that_are_none_are_refused():

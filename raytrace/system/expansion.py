@@ -47,8 +47,8 @@ def unexpanded(surfaces: Sequence[Surface]) -> dict[int, str]:
     """The names of media without an expansion, listed or stated, by the first surface of each."""
     names: dict[str, int] = {}
     for k, surface in enumerate(surfaces[:-1]):
-        own = medium_surfaces(surfaces)[k] == k and surface.glass.formula != "mirror"
-        if own and is_solid(surface.glass) and surface.glass.expansion is None and surface.expansion is None:
+        begins = medium_surfaces(surfaces)[k] == k and surface.glass.formula != "mirror"
+        if begins and is_solid(surface.glass) and surface.glass.expansion is None and surface.expansion is None:
             names.setdefault(label(surface.glass), k)
     return {k: name for name, k in names.items()}
 
