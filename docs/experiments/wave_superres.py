@@ -565,8 +565,8 @@ def _parts(table: Table, study: Study, command: str, figures: dict) -> list[str]
     noises = table.noises
     lines = [[f"{record['noise']:g}", *(f"{value:.2f}" for value in list(record.values())[1:])] for record in noises]
     caption = (
-        "Top: a scene that fills the sensor. Bottom: a small scene on a dark ground, imaged at several places and "
-        "restored jointly. Kernels: logarithmic, four decades."
+        "Restored images and kernels. Top: a scene that fills the sensor. Bottom: a small scene on a dark ground, "
+        "imaged at several places and restored jointly. Kernels: logarithmic, four decades."
     )
     return [
         "# Super-resolution from one exposure: does a learned element help?",
