@@ -4,6 +4,7 @@ import base64
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -95,6 +96,13 @@ def test_the_command_prints_the_table(capsys):
     assert {tool["name"] for tool in tools if tool["annotations"]["readOnlyHint"]} == {
         *("lenses", "check", "layout", "glass"),
     }
+
+
+def test_the_page_lists_the_tools():
+    table = (
+        (ROOT / "docs" / "reference" / "agents.md").read_text("utf-8").partition("| subject |")[2].partition("\n\n")[0]
+    )
+    assert {*re.findall(r"`(\w+)`", table)} == {*TOOLS}
 
 
 def test_a_missing_extra_and_a_missing_folder_are_one_line(capsys, monkeypatch, tmp_path):
