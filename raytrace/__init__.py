@@ -233,7 +233,7 @@ ERRORS = {
     "LensFileWarning": "io.source",
     "LostRays": "tracing.ray_failures",
     "MarginalRayLost": "tracing.launch",
-    "MissingExtra": "viewer.server",
+    "MissingExtra": "words",
     "NoCompiler": "tracing.compiler",
     "NoDerivatives": "tolerancing.jacobian",
     "NoFocus": "analysis.focus_report",

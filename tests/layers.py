@@ -36,7 +36,8 @@ FLOORS = {
     "imaging": 10,
     "viewer": 11,
     "cli": 13,
-    # measurements: nothing imports them
+    # the server of agents, and measurements: nothing imports them
+    "agents": 14,
     "bench": 14,
     # the public API
     "public": 15,

@@ -427,7 +427,7 @@ import builtins, io, pathlib, sys
 from raytrace import cli
 from raytrace.cli import commands
 builtins.open = io.open = pathlib.Path.read_text = None
-cli._version = str
+cli.version = str
 cli.build_parser()
 print(*sorted(name for name in sys.modules if name.startswith("raytrace.") and not name.startswith("raytrace.cli.")))
 """

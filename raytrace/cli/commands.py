@@ -5,6 +5,8 @@ parameter. A new command is a new row. A command that does more than call the fu
 """
 
 import argparse
+import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -60,7 +62,8 @@ class Command:
     """One command.
 
     examples: the last part of its help page; options: names of rows of OPTIONS, further rows, and groups of both; run:
-    module and function that return the result, where it is more than a call of the public function `verb` with a lens.
+    module and function that return the result, where it is more than a call of the public function `verb` with a lens;
+    carried_out_by: module and function that open the lens, run the command, and print and save its result.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Command:
     options: tuple[str | Adder, ...]
     run: str | None = None
     subcommands: tuple["Command", ...] = ()
+    carried_out_by: str = "cli.runner:carry_out"
 
     @property
     def verb(self) -> str:
@@ -99,13 +103,26 @@ class Command:
             parser.set_defaults(run=self, flags=flags, suffix="")
 
 
+def function(place: str) -> Callable:
+    """The function that a row names as module:name."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(f"raytrace.{module}"), name)
+
+
 def _command(
-    name: str, summary: str, description: str, examples: str, /, *options: str | Adder, run: str | None = None
+    name: str,
+    summary: str,
+    description: str,
+    examples: str,
+    /,
+    *options: str | Adder,
+    run: str | None = None,
+    carried_out_by: str = Command.carried_out_by,
 ) -> Command:
     """A row; examples: one a line, without `raytrace NAME`."""
     start = f"  raytrace {name.replace('wave-', 'wave ')} "
     text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
-    return Command(name, summary, description, text, options, run)
+    return Command(name, summary, description, text, options, run, carried_out_by=carried_out_by)
 
 
 def _of_module(name: str, module: ModuleType, run: str) -> Command:
@@ -194,6 +211,17 @@ COMMANDS = (
         lens.zmx --json | python3 -m json.tool
         lens.zmx -o prescription.csv""",
         *LENS, CONDITIONS, TABLE,
+    ),
+    _command(
+        "lenses",
+        "list the shipped lenses and the files of a folder",
+        "List the names and titles of the shipped lenses, and of a folder the files that commands read (lens files, "
+        "glass catalogs, checkpoints) and its folders.",
+        """
+        lenses
+        --json""",
+        Option("folder", file_name, "FOLDER", "folder to list", flag="folder", nargs="?", default="."),
+        "json", run="cli.runs:lenses",
     ),
     _command(
         "check",
@@ -422,6 +450,20 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         *LENS, CONDITIONS, Option("port", count, "N", "port of the server (default: a free one)"),
         switch("browser", "print the address, open no browser", flag="--no-browser", default=True),
         run="cli.runs:view",
+    ),
+    _command(
+        "mcp",
+        "let agents use the tracer",
+        "Serve agents (language models) by the Model Context Protocol over standard input and output: tools that "
+        "read, analyse, draw, optimise, search, tolerance and convert lenses. Files are read and written below one "
+        "folder only, and replaced only by request. A client starts this command. Needs the extra: pip install "
+        "'raytrace[mcp]'.",
+        """
+        --folder lenses
+        --folder . --json""",
+        Option("folder", file_name, "DIR", "folder below which files are read and written", required=True),
+        row("json", "print the tools with the schemas of their parameters as one JSON document, and serve none"),
+        carried_out_by="agents.server:carry_out",
     ),
     _command(
         "trace",

@@ -19,6 +19,7 @@ from raytrace.cli.runner import (
     say,
 )
 from raytrace.io import read_lens, write_lens
+from raytrace.io.listing import list_lenses
 from raytrace.maths.result import Result
 from raytrace.shards import share
 from raytrace.system.lens import with_sensor_distance
@@ -27,6 +28,11 @@ from raytrace.system.lens import with_sensor_distance
 def glass(arguments: argparse.Namespace) -> Result:
     """The data of a glass."""
     return raytrace.glass(**options_of(arguments), catalogs=catalogs(arguments))
+
+
+def lenses(arguments: argparse.Namespace) -> Result:
+    """The shipped lenses and the files of a folder."""
+    return list_lenses(arguments.folder)
 
 
 def check(arguments: argparse.Namespace) -> Result:
@@ -126,16 +132,13 @@ def tolerance(arguments: argparse.Namespace) -> Result:
 
 def view(arguments: argparse.Namespace) -> None:
     """The viewer until Ctrl-C."""
-    from raytrace.viewer.server import MissingExtra, serve  # loads the viewer
+    from raytrace.viewer.server import serve  # loads the viewer
 
     path = find_lens(arguments.lens)
     silence()
     file = path if Path(arguments.lens).exists() else Path(path.name)
     port = arguments.port or 0
-    try:
-        serve(open_lens(arguments), file=file, port=port, browser=arguments.browser, as_json=arguments.json)
-    except MissingExtra as error:
-        raise CommandError(str(error)) from error
+    serve(open_lens(arguments), file=file, port=port, browser=arguments.browser, as_json=arguments.json)
 
 
 def wave_psf(arguments: argparse.Namespace) -> Result:
