@@ -48,9 +48,7 @@ DIFFERENT = {
     "--resume": "codesign finds its own runs",
     "--depth": "layers of a network, distances of points, and a map",
     "--sensor": "its distance from an element, and its size",
-    **dict.fromkeys(
-        ("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"
-    ),
+    **dict.fromkeys(("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"),
 }
 
 
