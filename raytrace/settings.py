@@ -19,8 +19,8 @@ class Settings:
     @classmethod
     def recorded(cls, document: Mapping) -> dict[str, Any]:
         """The value of every field in the `settings.json` of a run, which may be older than the field."""
-        defaults = {field.name: field.default for field in dataclasses.fields(cls)} | cls.UNRECORDED
-        return defaults | {name: document[name] for name in defaults if name in document}
+        defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(cls)}
+        return {**defaults, **cls.UNRECORDED, **{name: document[name] for name in defaults if name in document}}
 
     @classmethod
     def of(cls, values: Mapping, **more: Any) -> Self:
