@@ -20,8 +20,7 @@ class Settings:
     def recorded(cls, document: Mapping) -> dict[str, Any]:
         """The value of every field in the `settings.json` of a run, which may be older than the field."""
         defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(cls)}
-        defaults |= cls.UNRECORDED
-        return defaults | {name: document[name] for name in defaults if name in document}
+        return {**defaults, **cls.UNRECORDED, **{name: document[name] for name in defaults if name in document}}
 
     @classmethod
     def of(cls, values: Mapping, **more: Any) -> Self:

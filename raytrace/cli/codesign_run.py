@@ -261,8 +261,8 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
                 bar.write(f"raytrace: {label}, lens step {record['lens_step']:.0f}: loss {record['loss']:.4f}{words}")
                 losses.clear()
             elif rest == 0:
-                at = f"epoch {epoch} of {epochs[name]}"
-                bar.write(f"raytrace: {label}, {name}, {at}: loss {sum(losses) / len(losses):.4f}{words}")
+                progressed = f"epoch {epoch} of {epochs[name]}"
+                bar.write(f"raytrace: {label}, {name}, {progressed}: loss {sum(losses) / len(losses):.4f}{words}")
                 losses.clear()
     finally:
         if bar is not None:
