@@ -10,6 +10,7 @@
 | phases            | gratings, holograms, diffractive lenses, ideal lenses, Fresnel facets: table PHASES        |
 | poses             | decentres and tilts                                                                        |
 | intersection      | rays and surfaces: point, normal, the first crossing of an asphere                         |
+| expansion         | the surfaces at another temperature                                                        |
 | rays              | Rays: positions, directions, validity, optical path                                        |
 | configurations    | the configurations of a zoom or multi-configuration lens                                   |
 | parameter_paths   | numbers of a lens by name                                                                  |
