@@ -28,6 +28,8 @@ from raytrace.cli import execute
 from raytrace.cli.progress import Lines
 from raytrace.words import RaytraceError
 
+_SENDING = threading.Lock()  # progress comes from a thread of its own
+
 
 def answer(name: str, values: dict, report: Callable[[Lines], object] | None = None) -> dict:
     """The result of a tool in the present folder: text, pictures (base64 of .png), document of `json`, is_error."""
@@ -82,8 +84,9 @@ def _listen(requests: "queue.SimpleQueue[dict]") -> None:
 
 
 def _send(wire: TextIO, message: dict) -> None:
-    wire.write(json.dumps(message) + "\n")  # one call: the progress comes from another thread
-    wire.flush()
+    with _SENDING:
+        wire.write(json.dumps(message) + "\n")
+        wire.flush()
 
 
 if __name__ == "__main__":
