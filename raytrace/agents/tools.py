@@ -19,10 +19,10 @@ from raytrace.words import RaytraceError, did_you_mean, known_option
 
 #: Given to the agent at the start.
 INSTRUCTIONS = (
-    "A sequential, differentiable ray tracer for lens design. Lenses are named by the name of a shipped lens "
-    "(`lenses` lists them) or by the path of a lens file relative to the folder of this server. Lengths are mm, "
-    "wavelengths µm, angles degrees, unless stated otherwise; surfaces count from 1. `json` gives all figures in full "
-    "precision, `plot` gives the figure."
+    "A sequential, differentiable ray tracer for lens design. Lenses are named by the name of a shipped lens (the tool "
+    "lenses lists them) or by the path of a lens file relative to the folder of this server. Lengths are mm, "
+    "wavelengths µm, angles degrees, unless stated otherwise; surfaces count from 1. The parameter json gives all "
+    "figures in full precision, plot the picture."
 )
 
 
