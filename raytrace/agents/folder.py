@@ -17,14 +17,14 @@ def check_files(arguments: argparse.Namespace, folder: Path, *, overwrite: bool)
     """Check every file of a command line before the work; folder: the present one of the process. Raises Refused."""
     for name, path in paths(arguments, InputFile):
         _below(folder, name, path)
-    for name, path in paths(arguments, OutputFile):
-        if _below(folder, name, path).exists() and not overwrite:
-            raise Refused(f"`{name}`: {path} exists; give another name, or `overwrite`")
-    for name, path in paths(arguments, OutputFolder):
-        target = _below(folder, name, path)
+    for name, written in paths(arguments, OutputFile):
+        if _below(folder, name, written).exists() and not overwrite:
+            raise Refused(f"`{name}`: {written} exists; give another name, or `overwrite`")
+    for name, filled in paths(arguments, OutputFolder):
+        target = _below(folder, name, filled)
         inside = [Path(root, entry) for root, *entries in os.walk(target) for part in entries for entry in part]
         if inside and not overwrite:
-            raise Refused(f"`{name}`: the folder {path} is not empty; give another name, or `overwrite`")
+            raise Refused(f"`{name}`: the folder {filled} is not empty; give another name, or `overwrite`")
         for entry in inside:
             _below(folder, name, str(entry))
 
