@@ -15,6 +15,9 @@ from raytrace import system as system
 from raytrace import tolerancing as tolerancing
 from raytrace import tracing as tracing
 from raytrace import wave_optics as wave_optics
+from raytrace.agents.folder import RefusedFile as RefusedFile
+from raytrace.agents.server import NoFolder as NoFolder
+from raytrace.agents.tools import BadParameter as BadParameter
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour

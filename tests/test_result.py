@@ -81,6 +81,10 @@ def results() -> dict[str, tuple]:
         "first_order": (lambda: rt.first_order(double), "power effective_focal_length optical_invariant"),
         "info": (lambda: rt.info(double), "radius thickness semi_diameter index"),
         "trace": (lambda: rt.trace(double), "x y z opl"),
+        "thermal": (
+            lambda: rt.thermal(single, samples=2),
+            "temperature effective_focal_length focus_shift_um rms_fixed_um modulation_fixed",
+        ),
         "glass": (lambda: rt.glass("N-BK7", temperature=40), "wavelength index dn_dt dn_dt_absolute"),
     }
 
