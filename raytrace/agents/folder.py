@@ -14,7 +14,7 @@ class RefusedFile(RaytraceError, ValueError):
 
 
 def check_files(arguments: argparse.Namespace, folder: Path, *, overwrite: bool) -> None:
-    """Check every file of a command line before the work; folder: the present one of the process. Raises RefusedFile."""
+    """Check every file of a command line before the work; folder: the present one. Raises RefusedFile."""
     for name, path in paths(arguments, InputFile):
         _below(folder, name, path)
     for name, written in paths(arguments, OutputFile):
