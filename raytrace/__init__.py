@@ -129,6 +129,7 @@ PUBLIC = {
     "ray_fan": "analysis.fans",
     "relative_illumination": "analysis.illumination",
     "rms_over_field": "analysis.rms",
+    "sag": "analysis.sag_table",
     "seidel": "analysis.seidel",
     "wavefront": "analysis.wavefronts",
     "grid": "maths.sampling",
@@ -270,7 +271,7 @@ TOP = (
     *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
-    *("rms_over_field", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
+    *("rms_over_field", "sag", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
     *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
 )
 #: Packages whose public names are typed with them.

@@ -15,6 +15,7 @@
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
+| sag                                         | sag, slope, aspheric departure, best-fit sphere of a surface   |
 | compare, abilities                          | PSF models, and the properties that each can represent         |
 
 `result` has what their results share (a lens, fields, a summary), `setting` their fields and wavelengths, `panels`

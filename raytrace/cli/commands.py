@@ -709,6 +709,25 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         "fields", "samples", switch("surfaces", "list every surface in the text, not only the sensor"),
     ),
     _command(
+        "sag",
+        "sag table of a surface, best-fit sphere, aspheric departure",
+        "Sag and slope of a surface over the radius, and its departure from the vertex sphere and from the best-fit "
+        "sphere, with the radius of that sphere and the largest and RMS departure over the aperture.",
+        """
+        phone 3 --step 0.1
+        double_gauss 1 --best-fit rim --plot sag.png -o sag.csv
+        cylinder_pair 1 --azimuth 0 --json""",
+        "lens", Option("surface", count, "SURFACE", "number of the surface", flag="surface"),
+        *LENS[1:], CONDITIONS, plot("sag, slope and departures"), TABLE,
+        Option("step", positive_finite, "MM", "of the radius (default: a round tenth of the semi-diameter)"),
+        Option("semi_diameter", positive_finite, "MM", "of the aperture (default: the surface's own, or that of the "
+            "rays of all fields)"),
+        Option("best_fit", help="sphere through the vertex by least squares of the sag over the aperture (rms), also "
+            "shifted along z (offset), or through vertex and rim (rim)", choices=("rms", "offset", "rim"),
+            default="rms"),
+        Option("azimuth", finite, "DEGREES", "of the direction, from x, of surfaces that are not round", default=90.0),
+    ),
+    _command(
         "rms-over-field",
         "RMS wavefront or spot over the field",
         "RMS wavefront error in waves over the field, of each wavelength and of all together by their weights, with "
