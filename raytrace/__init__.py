@@ -135,6 +135,8 @@ PUBLIC = {
     "grid": "maths.sampling",
     "psf": "psf_models",
     "view": "viewer.widget",
+    # drawings and solids
+    "draw": "workshop.sheets",
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
@@ -186,6 +188,7 @@ ERRORS = {
     "AmbiguousGlass": "materials.catalogs",
     "ArrayError": "maths.arrays",
     "BadCheckpoint": "optimization.checkpoint",
+    "BadIndication": "workshop.indications",
     "BadHold": "optimization.variables",
     "BadLimits": "system.parameter_paths",
     "BadMerit": "optimization.merit",
@@ -220,7 +223,7 @@ ERRORS = {
     "LensFileWarning": "io.source",
     "LostRays": "tracing.ray_failures",
     "MarginalRayLost": "tracing.launch",
-    "MissingExtra": "viewer.server",
+    "MissingExtra": "words",
     "NoCompiler": "tracing.compiler",
     "NoDerivatives": "tolerancing.jacobian",
     "NoFocus": "analysis.focus_report",
@@ -230,6 +233,7 @@ ERRORS = {
     "NoOptimum": "optimization.least_squares",
     "NoPictures": "imaging.pictures",
     "NoProblem": "optimization.problem",
+    "NoSolid": "workshop.parts",
     "NoStep": "optimization.least_squares",
     "NoThermalCoefficients": "materials.environment",
     "NotConverged": "psf_models.models",
@@ -267,7 +271,7 @@ ERRORS = {
 #: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All
 #: others are names of their packages, `rt.imaging.blur`.
 TOP = (
-    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "view", "glass", "to"),
+    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "view", "glass", "to"),
     *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),

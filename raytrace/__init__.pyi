@@ -32,6 +32,7 @@ from raytrace.analysis.layout import layout as layout
 from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.rms import rms_over_field as rms_over_field
+from raytrace.analysis.sag_table import sag as sag
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.setting import Incomplete as Incomplete
 from raytrace.analysis.setting import NothingToShow as NothingToShow
@@ -135,13 +136,16 @@ from raytrace.tracing.ray_listing import ChangesNothing as ChangesNothing
 from raytrace.tracing.ray_listing import trace as trace
 from raytrace.tracing.spot import EmptySpot as EmptySpot
 from raytrace.tracing.trace import Bent as Bent
-from raytrace.viewer.server import MissingExtra as MissingExtra
 from raytrace.viewer.widget import view as view
 from raytrace.wave_optics.height_maps import HeightMapError as HeightMapError
 from raytrace.wave_optics.hybrid import TooCoarse as TooCoarse
 from raytrace.wave_optics.plan import AliasedSampling as AliasedSampling
+from raytrace.words import MissingExtra as MissingExtra
 from raytrace.words import RaytraceError as RaytraceError
 from raytrace.words import RaytraceWarning as RaytraceWarning
+from raytrace.workshop.indications import BadIndication as BadIndication
+from raytrace.workshop.parts import NoSolid as NoSolid
+from raytrace.workshop.sheets import draw as draw
 
 __version__: str
 PUBLIC: dict[str, str]

@@ -23,6 +23,15 @@ class RaytraceError(Exception):
     """
 
 
+class MissingExtra(RaytraceError, ImportError):
+    """The libraries of an extra of the package are not installed."""
+
+
+def missing_extra(part: str, extra: str, error: ImportError) -> MissingExtra:
+    """The error of a part of the package whose import failed."""
+    return MissingExtra(f"{part} needs {error.name}: install it by pip install 'raytrace[{extra}]'", name=error.name)
+
+
 class RaytraceWarning(UserWarning):
     """A warning of this package, given once in a process; a filter of Python's, as "always", gives it at every line."""
 

@@ -33,6 +33,7 @@ FLOORS = {
     "optimization": 8,
     "tolerancing": 9,
     "imaging": 10,
+    "workshop": 10,
     "viewer": 11,
     "cli": 13,
     # measurements: nothing imports them

@@ -87,7 +87,8 @@ def test_data_pixels_and_figures_have_their_own_options(name):
     if "-o" in known:
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
-        wrong, said = ("x.pdf", "ends in .png") if name == "render" else ("x.png", "is a picture: figures are saved by")
+        others = {"render": ("x.pdf", "ends in .png"), "draw": ("x.zmx", "is no drawing")}
+        wrong, said = others.get(name, ("x.png", "is a picture: figures are saved by"))
         with pytest.raises(argparse.ArgumentTypeError, match=said):
             known["-o"].type(wrong)
     if "--size" in known and known["--size"].help != argparse.SUPPRESS:

@@ -22,7 +22,7 @@ SHOWN_BY = {
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn", "colour")
+DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn", "colour", "ezdxf", "OCP")
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -171,13 +171,13 @@ def test_physics_stays_in_torch(name):
 
 
 #: Distributions by the module that they install, where the names differ.
-DISTRIBUTIONS = {"PIL": "pillow", "colour": "colour-science", "mpl_toolkits": "matplotlib"}
+DISTRIBUTIONS = {"PIL": "pillow", "OCP": "cadquery-ocp-novtk", "colour": "colour-science", "mpl_toolkits": "matplotlib"}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """Viewer and measured cameras have extras."""
+    """Viewer, measured cameras, DXF and STEP files have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [name for extra in ("view", "colour") for name in project["optional-dependencies"][extra]]
+    extras = [name for extra in ("view", "colour", "cad") for name in project["optional-dependencies"][extra]]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
     library = MODULES.values()
     roots = {name.split(".")[0] for path in library for name in imports(path)}

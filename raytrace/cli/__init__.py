@@ -24,7 +24,7 @@ from typing import Any, NoReturn
 
 from raytrace.budget import keep_freed_memory
 from raytrace.files import NotWritten
-from raytrace.words import did_you_mean, in_command
+from raytrace.words import RaytraceError, did_you_mean, in_command
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
 
@@ -136,7 +136,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Exception as error:
             if os.environ.get("RAYTRACE_TRACEBACK"):
                 raise
-            if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
+            expected = isinstance(error, (RaytraceError, ValueError, LookupError, OSError))
+            if expected and not isinstance(error, KeyError | IndexError):
                 return _fail(_one_line(error), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
                 return _fail(f"not enough memory{_largest(arguments)}; --max-bytes refuses sooner", 1)

@@ -108,16 +108,13 @@ def tolerance(arguments: argparse.Namespace) -> Result:
 
 def view(arguments: argparse.Namespace) -> None:
     """The viewer until Ctrl-C."""
-    from raytrace.viewer.server import MissingExtra, serve  # loads the viewer
+    from raytrace.viewer.server import serve  # loads the viewer
 
     path = find_lens(arguments.lens)
     silence()
     file = path if Path(arguments.lens).exists() else Path(path.name)
     port = arguments.port or 0
-    try:
-        serve(open_lens(arguments), file=file, port=port, browser=arguments.browser, as_json=arguments.json)
-    except MissingExtra as error:
-        raise CommandError(str(error)) from error
+    serve(open_lens(arguments), file=file, port=port, browser=arguments.browser, as_json=arguments.json)
 
 
 def wave_psf(arguments: argparse.Namespace) -> Result:

@@ -61,6 +61,17 @@ def file_of(*suffixes: str) -> Callable[[str], OutputFile]:
     return reader
 
 
+def drawing_file(text: str) -> OutputFile:
+    """A drawing, or solids, to write."""
+    file = output_file(text)
+    file.suffixes = (".pdf", ".svg", ".png", ".dxf", ".step", ".stp", ".csv", ".json")
+    if PurePath(text).suffix.lower() not in file.suffixes:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no drawing: expected a name that ends in {', '.join(file.suffixes)}"
+        )
+    return file
+
+
 def lens_file(text: str) -> OutputFile:
     """A lens file to write."""
     from raytrace.io import WRITTEN  # loads torch

@@ -20,19 +20,11 @@ import torch
 
 from raytrace.system.lens import Lens
 from raytrace.viewer.session import Session
-from raytrace.words import RaytraceError
+from raytrace.words import missing_extra
 
 STATIC = Path(__file__).parent / "static"
 _TYPES = {"viewer.js": "text/javascript", "viewer.css": "text/css"}
 _MOST_SESSIONS, _MOST_BYTES, _LONGEST_NAME = 32, 1_000_000, 64
-
-
-class MissingExtra(RaytraceError, ImportError):
-    """The libraries of the viewer are not installed."""
-
-
-def missing(error: ImportError) -> MissingExtra:
-    return MissingExtra(f"the viewer needs {error.name}: install it by pip install 'raytrace[view]'", name=error.name)
 
 
 def application(lens: Lens, file: Path | None, token: str, port: int) -> Callable:
@@ -124,7 +116,7 @@ def serve(lens: Lens, *, file: Path | None = None, port: int = 0, browser: bool 
         port = listener.getsockname()[1]
         app = application(lens, file, token, port)
     except ModuleNotFoundError as error:
-        raise missing(error) from error
+        raise missing_extra("the viewer", "view", error) from error
     address = f"http://127.0.0.1:{port}/?token={token}"
     print(json.dumps({"address": address}) if as_json else f"{address}\nCtrl-C ends the viewer", flush=True)
     if browser:

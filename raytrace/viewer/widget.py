@@ -5,9 +5,10 @@ import warnings
 from typing import Any
 
 from raytrace.system.lens import Lens
-from raytrace.viewer.server import STATIC, missing, serve
+from raytrace.viewer.server import STATIC, serve
 from raytrace.viewer.session import Session
 from raytrace.viewer.state import State
+from raytrace.words import missing_extra
 
 
 def view(lens: Lens, *, port: int | None = None, browser: bool = True) -> Any:
@@ -34,7 +35,7 @@ def widget_of(lens: Lens) -> Any:
     try:
         import anywidget
     except ModuleNotFoundError as error:
-        raise missing(error) from error
+        raise missing_extra("the viewer", "view", error) from error
 
     class Viewer(anywidget.AnyWidget):
         """The viewer of a lens; `lens`: as edited."""
