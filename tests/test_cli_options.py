@@ -41,6 +41,7 @@ from raytrace.words import did_you_mean, in_command, option, with_options
 DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
+    "--step": "codesign chooses the unit of its variables, sag takes a length",
     "--start": "compare chooses from two places, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
     "--configuration": "layout draws all of them in one figure",

@@ -166,10 +166,11 @@ def sag(
         raise ValueError(f"{option('best_fit', best_fit)}: expected one of {', '.join(BEST_FIT)}")
     place = dataclasses.replace(lens.surfaces[surface], phase=None)  # facets have slopes that are not those of the sag
     h = semi_diameters(detached(lens))[surface] if semi_diameter is None else semi_diameter
-    if not 0 < h < edge_radius(place):
-        found = "no semi-diameter is known" if math.isnan(h) else f"a semi-diameter of {h:.6g} mm"
+    edge = edge_radius(detached(place))
+    if not 0 < h < edge:
+        state = "no semi-diameter is known" if math.isnan(h) else f"a semi-diameter of {h:.6g} mm"
         raise ValueError(
-            f"surface {surface}: {found}; expected one above 0 and below {edge_radius(place):.6g} mm, where the sag "
+            f"surface {surface}: {state}; expected one above 0 and below {edge:.6g} mm, where the sag "
             f"ends: give {option('semi_diameter')}"
         )
     step = style.round_length(h / 10) if step is None else step

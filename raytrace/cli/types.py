@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import TypeAlias
 
+from raytrace.settings import DRAWINGS
+
 Reader: TypeAlias = Callable[[str], object]
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -64,7 +66,7 @@ def file_of(*suffixes: str) -> Callable[[str], OutputFile]:
 def drawing_file(text: str) -> OutputFile:
     """A drawing, or solids, to write."""
     file = output_file(text)
-    file.suffixes = (".pdf", ".svg", ".png", ".dxf", ".step", ".stp", ".csv", ".json")
+    file.suffixes = DRAWINGS
     if PurePath(text).suffix.lower() not in file.suffixes:
         raise argparse.ArgumentTypeError(
             f"{text!r} is no drawing: expected a name that ends in {', '.join(file.suffixes)}"

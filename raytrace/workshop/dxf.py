@@ -39,8 +39,10 @@ def write(path: str | PathLike, title: str, parts: Sequence[tuple[Part, Sequence
             shift = left - float(z.min())
             _part(space, part, shift)
             for k, line in enumerate(lines):
-                at = (left, -part.rim - (3 + 1.8 * k) * size)
-                space.add_text(line.replace("⌀", "%%c"), height=size, dxfattribs={"layer": "TEXT"}).set_placement(at)
+                corner = (left, -part.rim - (3 + 1.8 * k) * size)
+                space.add_text(line.replace("⌀", "%%c"), height=size, dxfattribs={"layer": "TEXT"}).set_placement(
+                    corner
+                )
             left = float(z.max()) + shift + max(4.0, 0.7 * size * max(map(len, lines)))
         content = io.StringIO()
         document.write(content)

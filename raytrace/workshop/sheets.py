@@ -20,8 +20,9 @@ from raytrace.analysis.sag_table import sag
 from raytrace.files import write_atomically
 from raytrace.materials.glass import abbe_number, has_abbe_number, label, nd
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Column, Result, Table
+from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.plotting import style
+from raytrace.settings import DRAWINGS
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.tolerancing.elements import cemented_groups
@@ -33,9 +34,6 @@ from raytrace.workshop import dxf, step
 from raytrace.workshop.indications import Indications, limits, stated
 from raytrace.workshop.paper import HEIGHT, MARGIN, WIDTH, Paper, scale_for, scale_text
 from raytrace.workshop.parts import Face, Part, parts_of
-
-#: Suffixes of `Drawings.save`.
-SUFFIXES = (".pdf", ".svg", ".png", ".dxf", ".step", ".stp", ".csv", ".json")
 
 _FOOT = 58.0  # mm: top of the table and of the title block of an element
 _SPLIT = 178.0  # mm: right end of the table
@@ -81,6 +79,10 @@ class Drawings(Result):
         notes = [f"not drawn: {part.objection}" if part.objection else cut if part.cuts else "" for part in self.parts]
         return {"material": [label(part.glass) for part in self.parts], "note": notes}
 
+    def document(self) -> dict:
+        parts = plain(self.to_frame().to_dict("records"))
+        return {"name": self.lens.name, "parts": parts, "tolerances": self.indications.sources()}
+
     def tables(self) -> list[Table]:
         sources = self.indications.sources()
         note = f"tolerances: {'; '.join(sources)}" if sources else "tolerances: the lens has none"
@@ -107,9 +109,9 @@ class Drawings(Result):
 
     def _contents(self) -> list[list[Part]]:
         """The parts of every sheet; none for the whole lens."""
-        named = {part.name: part for part in self.parts if not part.objection and part.name in self.chosen}
-        single = [[named[name]] for name in self.chosen if name in named]
-        groups = [[named[name] for name in group] for group in self.groups if named.keys() >= set(group)]
+        by_name = {part.name: part for part in self.parts if not part.objection and part.name in self.chosen}
+        single = [[by_name[name]] for name in self.chosen if name in by_name]
+        groups = [[by_name[name] for name in group] for group in self.groups if by_name.keys() >= set(group)]
         return [*([[]] if self.has_assembly else []), *single, *groups]
 
     @style.styled
@@ -121,10 +123,10 @@ class Drawings(Result):
         """Write .pdf (a page a sheet), .svg or .png (a file a sheet, numbered), .dxf or .step, or the table (.csv,
         .json). Raises MissingExtra for .dxf and .step without the extra `cad`."""
         suffix = Path(path).suffix.lower()
-        if suffix not in SUFFIXES:
-            raise ValueError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+        if suffix not in DRAWINGS:
+            raise ValueError(f"{path}: expected a name that ends in {', '.join(DRAWINGS)}")
         if suffix in (".csv", ".json"):
-            super().save(path)
+            Result.save(self, path)
         elif suffix == ".dxf":
             title = self.lens.name or "Lens"
             dxf.write(path, title, [(part, _lines(self, [part])) for part in self.drawn_parts()])
@@ -244,25 +246,22 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
     outlines = np.concatenate([_outline(part) + move for part, move in zip(parts, moves, strict=True)], axis=1)
     (low, high), rim = (outlines[0].min(), outlines[0].max()), max(part.rim for part in parts)
     right = 192.0 if aspheric else WIDTH - MARGIN
-    scale = scale_for(high - low, 2 * rim, (right - MARGIN - 64, _TOP - _FOOT - 40))
+    lines = _below(drawings, parts, right - MARGIN - 4)
+    foot = _FOOT + 3.4 * len(lines)
+    scale = scale_for(high - low, 2 * rim, (right - MARGIN - 64, _TOP - foot - 34))
     centre = 0.5 * (MARGIN + right) - 4
-    start, axis = centre - 0.5 * scale * (low + high), 0.5 * (_FOOT + _TOP) + 1
+    start, axis = centre - 0.5 * scale * (low + high), 0.5 * (foot + _TOP) + 1
 
     for part, offset in zip(parts, offsets[:-1], strict=True):
         _draw_part(paper, part, lambda z, r, offset=offset: (start + scale * (z + offset), axis + scale * r))
     left_end, right_end = start + scale * low, start + scale * high
     paper.line((left_end - 8, axis), (right_end + 8, axis), kind="axis")
-    front, back = parts[0].faces[0], parts[-1].faces[1]
-    thick, rim_of = float(offsets[-1]), {id(front): parts[0].rim, id(back): parts[-1].rim}
-    for face, x, end, offset in (
-        (front, left_end - 12, 0.0, 0.0),
-        (back, right_end + 12, 0.0, float(offsets[-2])),
-    ):
-        if face is back and parts[-1].is_mirror:
-            continue
-        height = min(face.clear, rim_of[id(face)])
-        end = start + scale * (float(face.z(np.array([height]))[0]) + offset)
-        paper.up(x, axis - scale * height, axis + scale * height, end, f"⌀e {2 * height:.6g}")
+    thick = float(offsets[-1])
+    ends = [(parts[0], 0, left_end - 12, 0.0), (parts[-1], 1, right_end + 12, float(offsets[-2]))]
+    for part, end, x, offset in ends[: 1 if parts[-1].is_mirror else 2]:
+        height = min(part.faces[end].clear, part.rim)
+        rim_end = start + scale * (float(part.ends(np.array([height]))[end][0]) + offset)
+        paper.up(x, axis - scale * height, axis + scale * height, rim_end, f"⌀e {2 * height:.6g}")
     widest = max(parts, key=lambda part: part.rim)
     z_rim = offsets[parts.index(widest)] + widest.ends(np.array([widest.rim]))[1][0]
     paper.up(right_end + 22, axis - scale * rim, axis + scale * rim, start + scale * float(z_rim), f"⌀ {2 * rim:.6g}")
@@ -277,9 +276,8 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
         paper.across(*edges, top + 7, (top, top), f"({widest.edge:.4g})")
 
     _table_of_faces(paper, drawings, parts)
-    lines = _below(drawings, parts)
     for k, face in enumerate(aspheric):
-        _asphere(paper, lens, face, "left" if face is front else "right", 196.0, _TOP - 4 - k * 66)
+        _asphere(paper, lens, face, "left" if face is parts[0].faces[0] else "right", 196.0, _TOP - 4 - k * 66)
     for k, line in enumerate(lines):
         paper.fitted(MARGIN + 2, _FOOT + 3 + 3.4 * (len(lines) - 1 - k), line, right - MARGIN - 4, 6)
     _title_block(paper, drawings, name, scale, (_SPLIT, _FOOT))
@@ -333,7 +331,7 @@ def _material(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
             f"{p.name}: {label(p.glass)}, {p.thickness:.6g} {limits(given.row('thickness', p.surfaces[0]))}"
             for p in parts
         ]
-        cells = [*cells[:5], *[""] * (5 - len(cells[:5]))]
+        cells = [*cells[:4], "; ".join(cells[4:])] if len(cells) > 5 else [*cells, *[""] * (5 - len(cells))]
         return [*cells, "cement –", f"decentre in the mount {shift}", f"tilt in the mount {tilt}"]
     part, k = parts[0], parts[0].surfaces[0]
     if part.is_mirror:
@@ -353,13 +351,14 @@ def _material(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
     ]
 
 
-def _below(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
-    """Lines between drawing and table: further tolerances, and the meaning of dashes and fringes."""
-    lines = [line for part in parts for line in drawings.indications.others(part)][:4]
+def _below(drawings: Drawings, parts: Sequence[Part], width: float) -> list[str]:
+    """Lines between drawing and table, of a width in mm: further tolerances, their source, dashes and fringes."""
+    others = "; ".join(line for part in parts for line in drawings.indications.others(part))
     sources = "; ".join(drawings.indications.sources())
-    lines.append(f"Tolerances: {sources}." if sources else "The lens has no tolerances.")
-    lines.append("Lengths in mm. 3/ in fringes of 546.07 nm. –: not specified. (): auxiliary dimension.")
-    return lines
+    text = [others.replace("-", "−")] if others else []
+    text.append(f"Tolerances: {sources}." if sources else "The lens has no tolerances.")
+    text.append("Lengths in mm. 3/ in fringes of 546.07 nm. –: not specified. (): auxiliary dimension.")
+    return style.fill("\n".join(text), width / 25.4, 6).splitlines()
 
 
 def _lines(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
@@ -465,12 +464,12 @@ def _assembly(drawings: Drawings) -> Paper:
         surfaces = "–".join(map(str, sorted({*part.surfaces})))
         mount = given.mounting(*part.surfaces)
         rows.append((part.name, surfaces, label(part.glass) or "–", thick, f"{2 * part.rim:.6g}", *mount))
-    named = {part.name: part for part in parts}
+    by_name = {part.name: part for part in parts}
     for group in drawings.groups:
-        if all(name in named for name in group):
-            first, last = named[group[0]].surfaces[0], named[group[-1]].surfaces[1]
-            total = sum(named[name].thickness for name in group)
-            widest = 2 * max(named[name].rim for name in group)
+        if all(name in by_name for name in group):
+            first, last = by_name[group[0]].surfaces[0], by_name[group[-1]].surfaces[1]
+            total = sum(by_name[name].thickness for name in group)
+            widest = 2 * max(by_name[name].rim for name in group)
             cells = ("+".join(group), f"{first}–{last}", "cemented", f"{total:.6g}", f"{widest:.6g}")
             rows.append((*cells, *given.mounting(first, last)))
     pitch = min(5.0, (foot - MARGIN - 6) / len(rows))
@@ -478,7 +477,7 @@ def _assembly(drawings: Drawings) -> Paper:
     gaps = [("Vertex distance", "mm"), *_distances(drawings)]
     paper.table(_SPLIT + 2, foot, (62, WIDTH - MARGIN - _SPLIT - 64), gaps, min(5.0, 46 / len(gaps)))
     left_out = [f"not drawn: element {part.name}, {part.objection}" for part in drawings.parts if part.objection]
-    for k, line in enumerate([*left_out[:3], *_below(drawings, ())][::-1]):
+    for k, line in enumerate([*left_out[:3], *_below(drawings, (), WIDTH - 2 * MARGIN - 4)][::-1]):
         paper.fitted(MARGIN + 2, foot + 3 + 3.4 * k, line, WIDTH - 2 * MARGIN - 4, 6)
     _title_block(paper, drawings, f"Assembly of {len(parts)} parts", scale, (_SPLIT + 2, 44.0))
     return paper
@@ -494,11 +493,12 @@ def _distances(drawings: Drawings) -> list[tuple[str, str]]:
     stations = {end for part in drawings.parts for end in part.surfaces} | {lens.stop, len(lens.surfaces) - 1}
     inside = {(a, b) for a, b in (part.surfaces for part in drawings.parts) if a != b}
     names = {lens.stop: " (stop)", len(lens.surfaces) - 1: " (image)"}
-    named = {end: f"{end}{names.get(end, '')}" for end in stations}
+    words = {end: f"{end}{names.get(end, '')}" for end in stations}
     rows, order = [], sorted(stations)
     for a, b in itertools.pairwise(order):
         if any(first <= a and b <= last for first, last in inside):
             continue
         length = abs(float(sum(surface.thickness for surface in lens.surfaces[a:b])))
-        rows.append((f"surface {named[a]} to {named[b]}", f"{length:.6g} {limits(given.row('thickness', a))}".rstrip()))
+        tolerance = limits(given.row("thickness", a))
+        rows.append((f"surface {words[a]} to {words[b]}", f"{length:.6g} {tolerance}".rstrip()))
     return rows

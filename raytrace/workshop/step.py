@@ -4,6 +4,7 @@ Planes, spheres, cones and cylinders are exact; other sags are B-splines within 
 product for each part, in an assembly with the name of the lens. A decentred or rectangular aperture cuts its mirror.
 """
 
+import itertools
 import math
 import re
 import tempfile
@@ -36,9 +37,6 @@ def write(path: str | PathLike, lens: Lens, parts: Sequence[Part], date: str = "
         from OCP.XCAFDoc import XCAFDoc_DocumentTool
     except ModuleNotFoundError as error:
         raise missing_extra("a STEP file", "cad", error) from error
-    messenger = Message.DefaultMessenger_s()
-    for printer in list(messenger.Printers()):
-        messenger.RemovePrinter(printer)  # the library reports every transfer on standard output
     document = TDocStd_Document(TCollection_ExtendedString("XmlOcaf"))
     shapes = XCAFDoc_DocumentTool.ShapeTool_s(document.Main())
 
@@ -55,11 +53,24 @@ def write(path: str | PathLike, lens: Lens, parts: Sequence[Part], date: str = "
     shapes.UpdateAssemblies()
     with tempfile.TemporaryDirectory() as folder:
         file, writer = Path(folder) / "lens.step", STEPCAFControl_Writer()
+        messenger = Message.DefaultMessenger_s()
+        printers = list(messenger.Printers())
+        for printer in printers:
+            messenger.RemovePrinter(printer)  # of a report of the transfer on standard output
         writer.Transfer(document)
         writer.Write(str(file))
+        for printer in printers:
+            messenger.AddPrinter(printer)
         text = file.read_bytes()
-    stamp = f"'{date or _DATE}T00:00:00'".encode()
+    day = date if re.fullmatch(r"\d{4}-\d\d-\d\d", date) else _DATE
+    stamp = f"'{day}T00:00:00'".encode()
     text = re.sub(rb"'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[^']*'", stamp, text, count=1)
+    occurrences = itertools.count(1)  # the library counts on from file to file
+    text = re.sub(
+        rb"NEXT_ASSEMBLY_USAGE_OCCURRENCE\('\d+'",
+        lambda _: b"NEXT_ASSEMBLY_USAGE_OCCURRENCE('%d'" % next(occurrences),
+        text,
+    )
     text = re.sub(rb"FILE_NAME\('[^']*'", b"FILE_NAME('lens.step'", text, count=1)
     write_atomically(path, lambda target: target.write(text))
 
