@@ -7,6 +7,7 @@ BEST_FIT lists the definitions of the best-fit sphere. A departure is the sag of
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -176,7 +177,7 @@ def sag(
     step = style.round_length(h / 10) if step is None else step
     if not step > 0:
         raise ValueError(f"{option('step', step)}: expected a length above 0 mm")
-    like = {"dtype": torch.float64, "device": lens.wavelengths.device}
+    like: dict[str, Any] = {"dtype": torch.float64, "device": lens.wavelengths.device}
     count = math.ceil(h / step * (1 - 1e-12))
     radii = torch.tensor([*(k * step for k in range(count)), h], **like)
     angle = math.radians(azimuth)

@@ -4,6 +4,7 @@ A sheet is A4. An element has its profile to scale, a table of its left surface,
 block; an asphere its equation, coefficients and sag table; the whole lens its parts and the distances of vertices.
 """
 
+import functools
 import io
 import itertools
 import math
@@ -252,8 +253,11 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
     centre = 0.5 * (MARGIN + right) - 4
     start, axis = centre - 0.5 * scale * (low + high), 0.5 * (foot + _TOP) + 1
 
+    def place(offset: float, z: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return start + scale * (z + offset), axis + scale * r
+
     for part, offset in zip(parts, offsets[:-1], strict=True):
-        _draw_part(paper, part, lambda z, r, offset=offset: (start + scale * (z + offset), axis + scale * r))
+        _draw_part(paper, part, functools.partial(place, offset))
     left_end, right_end = start + scale * low, start + scale * high
     paper.line((left_end - 8, axis), (right_end + 8, axis), kind="axis")
     thick = float(offsets[-1])
@@ -268,12 +272,11 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
     bottom = axis - scale * rim - 9
     first = parts[0].surfaces[0]
     row = given.row("thickness", first) if len(parts) == 1 else None
-    vertices = start, start + scale * thick
-    paper.across(*vertices, bottom, (axis, axis), f"{thick:.6g} {limits(row)}".rstrip())
+    paper.across(start, start + scale * thick, bottom, (axis, axis), f"{thick:.6g} {limits(row)}".rstrip())
     if len(parts) == 1:
-        edges = [start + scale * float(z[0]) for z in widest.ends(np.array([widest.rim]))]
+        start_of_edge, end_of_edge = (start + scale * float(z[0]) for z in widest.ends(np.array([widest.rim])))
         top = axis + scale * rim
-        paper.across(*edges, top + 7, (top, top), f"({widest.edge:.4g})")
+        paper.across(start_of_edge, end_of_edge, top + 7, (top, top), f"({widest.edge:.4g})")
 
     _table_of_faces(paper, drawings, parts)
     for k, face in enumerate(aspheric):
@@ -381,7 +384,7 @@ def _asphere(paper: Paper, lens: Lens, face: Face, where: str, x: float, top: fl
     terms = "" if surface.coefficients is None else f" + Σ aₙ r{'ⁿ' if powers else ''}"
     paper.text(x, top - 4.5, f"z = c r² / (1 + √(1 − (1 + k) c² r²)){terms},  c = 1/R", 6.5)
     conic = 0.0 if surface.conic is None else float(surface.conic)
-    lines = [f"R   {face.side / float(surface.curvature):.9g}" if face.curvature else "R   ∞", f"k   {conic:.9g}"]
+    lines = [f"R   {1 / face.curvature:.9g}" if face.curvature else "R   ∞", f"k   {conic:.9g}"]
     for k, a in enumerate([] if surface.coefficients is None else surface.coefficients.tolist()):
         if a:
             lines.append(f"{kind.name_of(k)}   {face.side * a:.10g}")
@@ -441,11 +444,14 @@ def _assembly(drawings: Drawings) -> Paper:
     scale = scale_for(right - left, high - low, room)
     x0 = 0.5 * WIDTH - 0.5 * scale * (left + right)
     y0 = 0.5 * (102 + _TOP) - 0.5 * scale * (low + high)
+
+    def on_paper(part: Part, z: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _scaled(at(part, z, r), scale, (x0, y0))
+
     tags: list[tuple[float, float]] = []
     for part in parts:
-        _draw_part(paper, part, lambda z, r, part=part: _scaled(at(part, z, r), scale, (x0, y0)))
-        z, r = np.concatenate(_shapes(part), axis=1)
-        x, y = _scaled(at(part, z, r), scale, (x0, y0))
+        _draw_part(paper, part, functools.partial(on_paper, part))
+        x, y = on_paper(part, *np.concatenate(_shapes(part), axis=1))
         tag = float(x[y > y.max() - 0.5].mean()), float(y.max()) + 3
         while any(abs(tag[0] - x) < 4 and abs(tag[1] - y) < 3.5 for x, y in tags):
             tag = tag[0], tag[1] + 3.5
