@@ -8,6 +8,7 @@ import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from raytrace.agents.tools import TOOLS
 from raytrace.cli import main
 from raytrace.cli.commands import COMMANDS
 from raytrace.io import FORMATS, oslo, ray_optics
@@ -36,6 +37,34 @@ def commands() -> str:
     names[at : at + 1] = [("wave", part) for part in WAVE]
     parts = [f"## `raytrace {' '.join(words)}`\n\n```text\n{help_of(*words)}\n```\n" for words in names]
     return "# Commands\n\nThe text of `raytrace COMMAND --help`.\n\n" + "\n".join(parts)
+
+
+def tools() -> str:
+    """A section for each tool of the server of agents, with its parameters."""
+    parts = ["# Tools of agents\n\nParameters of the tools that `raytrace mcp` serves.\n"]
+    for tool in TOOLS.values():
+        schema = tool.schema()
+        parts.append(f"## `{tool.name}`\n\n{tool.description}\n\n| parameter | type | meaning |\n|---|---|---|")
+        for name, parameter in schema["properties"].items():
+            needed = " (required)" if name in schema["required"] else ""
+            meaning = parameter["description"].replace("|", "\\|")
+            parts.append(f"| `{name}`{needed} | {_kind(parameter)} | {meaning} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _kind(schema: Mapping) -> str:
+    """The type of a JSON schema in words."""
+    if "items" in schema:
+        return f"list of {_kind(schema['items'])}"
+    if "enum" in schema:
+        return ", ".join(f"`{choice}`" for choice in schema["enum"])
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    if "anyOf" in schema:
+        return " or ".join(map(_kind, schema["anyOf"]))
+    kinds = schema["type"]
+    return " or ".join(kinds) if isinstance(kinds, list) else kinds
 
 
 def operands() -> str:
@@ -202,7 +231,8 @@ def formats() -> str:
 def write(*_) -> None:
     """Write the pages whose text has changed."""
     FOLDER.mkdir(exist_ok=True)
-    for name, text in (("commands", commands()), ("operands", operands()), ("formats", formats())):
+    pages = {"commands": commands(), "tools": tools(), "operands": operands(), "formats": formats()}
+    for name, text in pages.items():
         page = FOLDER / f"{name}.md"
         if not page.exists() or page.read_text("utf-8") != text:
             page.write_text(text, "utf-8")

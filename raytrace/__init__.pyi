@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from raytrace import analysis as analysis
+from raytrace import edit as edit
 from raytrace import imaging as imaging
 from raytrace import io as io
 from raytrace import materials as materials
@@ -38,11 +39,15 @@ from raytrace.analysis.setting import Incomplete as Incomplete
 from raytrace.analysis.setting import NothingToShow as NothingToShow
 from raytrace.analysis.sheared_batch import ClippedBeam as ClippedBeam
 from raytrace.analysis.spot_diagram import spot as spot
+from raytrace.analysis.thermal import thermal as thermal
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong
 from raytrace.cli.runner import CommandError as CommandError
 from raytrace.cli.settings import BadSettings as BadSettings
+from raytrace.edit.choice import BadEdit as BadEdit
+from raytrace.edit.choice import LeftAsItWas as LeftAsItWas
+from raytrace.edit.choice import LeftOut as LeftOut
 from raytrace.files import NotWritten as NotWritten
 from raytrace.imaging import Camera as Camera
 from raytrace.imaging import Variables as Variables
@@ -83,6 +88,7 @@ from raytrace.maths.numerics import to as to
 from raytrace.optimization.attained import NotReached as NotReached
 from raytrace.optimization.between import WorseBetween as WorseBetween
 from raytrace.optimization.checkpoint import BadCheckpoint as BadCheckpoint
+from raytrace.optimization.conditions import ReplacedCondition as ReplacedCondition
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.least_squares import NoOptimum as NoOptimum

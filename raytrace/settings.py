@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 T = TypeVar("T")
 
@@ -12,6 +12,15 @@ class Settings:
     """seed: of all random numbers."""
 
     seed: int = 0
+
+    #: Values of fields in runs that do not record them, where the default is another one now.
+    UNRECORDED: ClassVar[Mapping[str, object]] = {}
+
+    @classmethod
+    def recorded(cls, document: Mapping) -> dict[str, Any]:
+        """The value of every field in the `settings.json` of a run, which may be older than the field."""
+        defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(cls)}
+        return {**defaults, **cls.UNRECORDED, **{name: document[name] for name in defaults if name in document}}
 
     @classmethod
     def of(cls, values: Mapping, **more: Any) -> Self:
@@ -42,19 +51,22 @@ class CodesignSettings(Settings):
     sensor: width and height; () for a grey camera of field points. Pictures of a sensor have the channels of its
     response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
     `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
-    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step:
-    unit of the variables, "sag" or "blur"; optimizer: of the lens, "adam", together with the network, or "lm", steps of
-    second order to the optimum of the closed form, behind which the network is trained; relearn: epochs of step 1 again
-    with the nearest glasses of the catalogs, in place of model glasses that vary; filters: of the closed form,
+    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step: unit of the
+    variables, "sag" or "blur"; optimizer: of the lens, "lm", steps of second order to the optimum of the closed form,
+    behind which the network is trained, or "adam", together with the network; turns: of the lens, by steps of second
+    order for the loss of a network that adapts to it, and of the network again, as many epochs; relearn: epochs of step
+    1 again with the nearest glasses of the catalogs, in place of model glasses that vary; filters: of the closed form,
     "separate" or "joint", of colours; glass_thickness, air_thickness, edge: limits; start: of the sensor, for an object
-    at focus_distance; near, far, spread: range and distribution of object distances; fields: points in y, one after
-    the other for successive samples; pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its
+    at focus_distance; near, far, spread: range and distribution of object distances; fields: points in y, one after the
+    other for successive samples; pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its
     layers, or poolings, and maps; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
     as_built: training draws a perturbed lens for each sample; grade, limits: its tolerances, by default those of the
     file; refocus: "sensor", or "none"; cameras: perturbed ones of the test; center: of the PSF window, "" for the
     centroid of the light with tolerances and the chief ray without.
-    A stored run without one of the fields has its default.
+    A stored run without one of the fields has its default (`recorded`), one without `optimizer` is of Adam.
     """
+
+    UNRECORDED: ClassVar[Mapping[str, object]] = {"optimizer": "adam"}
 
     model: str = "gaussian"
     vary: str = "sensor"
@@ -64,7 +76,8 @@ class CodesignSettings(Settings):
     edge: float | None = None
     hold: str = ""
     step: Literal["sag", "blur"] = "sag"
-    optimizer: Literal["adam", "lm"] = "adam"
+    optimizer: Literal["adam", "lm"] = "lm"
+    turns: int = 0
     relearn: int = 0
     filters: str = "separate"
     start: str = "paraxial"

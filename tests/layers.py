@@ -27,6 +27,7 @@ FLOORS = {
     "io": 4,
     # computations
     "tracing": 5,
+    "edit": 6,
     "psf_models": 6,
     "analysis": 7,
     "wave_optics": 7,
@@ -36,7 +37,8 @@ FLOORS = {
     "workshop": 10,
     "viewer": 11,
     "cli": 13,
-    # measurements: nothing imports them
+    # the server of agents, and measurements: nothing imports them
+    "agents": 14,
     "bench": 14,
     # the public API
     "public": 15,

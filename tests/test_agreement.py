@@ -18,7 +18,7 @@ from problems import MICROMETRE, PICOMETRE, own_fields
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
 from raytrace.imaging.built_lens import lens_as_built
-from raytrace.optimization.problem import conditions_of
+from raytrace.optimization.conditions import conditions_of
 from raytrace.system.lens import Lens, media
 from raytrace.tolerancing.criteria import CRITERIA
 from raytrace.tolerancing.study import Study, View, sampling_of

@@ -21,8 +21,9 @@ from raytrace.settings import GRADES, CodesignSettings
 from raytrace.shards import Share
 from raytrace.system.tolerance_data import Compensator
 from raytrace.tolerancing import grades
+from raytrace.tracing import launch as launching
 
-SMALL = CodesignSettings(depth=2, width=2, patch=8, size=7, epochs=2, batch=4, crops=2, cameras=2)
+SMALL = CodesignSettings(optimizer="adam", depth=2, width=2, patch=8, size=7, epochs=2, batch=4, crops=2, cameras=2)
 BUILT = dataclasses.replace(SMALL, as_built=True, grade="commercial", vary="sensor curvature:1,10")
 DISTANCES = torch.tensor([12e3, 20e3, 45e3], dtype=torch.float64)
 
@@ -297,3 +298,23 @@ def test_a_sensor_in_colour_takes_lenses_as_built(lens):
             wanted = torch.einsum("cw,wij->cij", weights, colours).flip(-1)
             wanted = wanted / wanted.sum((1, 2), keepdim=True)
             assert float((kernels[k] - wanted).abs().sum((1, 2)).max()) < 1e-9
+
+
+def test_lenses_as_built_at_places_of_their_own_are_aimed_together(monkeypatch):
+    """Entrance pupils are found once in each trace, however many lenses there are, and a kernel is that of its lens
+    alone."""
+    lens = rt.read_lens("cemented_achromat").at(ray_aiming="real", wavelengths=(0.55,))
+    tolerances = rt.tolerances(lens, grade="precision", compensators=())
+    camera = rt.Camera(
+        rt.Variables(lens, "sensor"), torch.nn.Identity(), sensor=rt.Sensor((3, 2), (300, 200)), pixels=7,
+        tolerances=tolerances, model=rt.psf_models.Gaussian(order=2),
+    )  # fmt: skip
+    errors, aimed = rt.tolerancing.draw_errors(tolerances, 2, seed=2), []
+    points = torch.tensor([[0.0, 1.0], [0.6, -0.8]], dtype=torch.float64)
+    entrance_of = launching.entrance_of
+    monkeypatch.setattr(launching, "entrance_of", lambda lens: (aimed.append(lens.count), entrance_of(lens))[1])
+    with torch.no_grad():
+        together = camera.kernels(DISTANCES[:2], errors=errors, points=points)
+        assert len(aimed) == 2  # of the chief rays, and of the rays of the kernels
+        alone = camera.kernels(DISTANCES[1:2], errors=errors[1], points=points[:, 1:])
+    assert float((together[1] - alone[0]).abs().max()) < 1e-12

@@ -37,12 +37,12 @@ from raytrace.imaging.codesign import (
     write_outcome,
 )
 from raytrace.imaging.field_kernels import EnergyOutside
-from raytrace.imaging.image import blur
+from raytrace.imaging.image import blur, pixel_means
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import dead_leaves, split
 from raytrace.imaging.sensor import Sensor
 from raytrace.imaging.training import Run, Share
-from raytrace.imaging.variables import PhaseVariables, Variables
+from raytrace.imaging.variables import OtherLens, PhaseVariables, Variables
 from raytrace.io import read_lens
 from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models import DRT, Gaussian, Paraxial, psf
@@ -51,10 +51,11 @@ from raytrace.system.lens import with_object_distance
 from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.focus import NoImage, best_focus, focused
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.wave_optics.compute import phase_elements
 from raytrace.wave_optics.element import phase_element
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
-SMALL = CodesignSettings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
+SMALL = CodesignSettings(optimizer="adam", depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
 MICROMETRE = 1e-3
 COLOUR = Sensor(size=(24, 16), pixels=(240, 160), response="rgb", mosaic="RGGB", full_well=1e3, read_noise=2, bits=8)
 NOISY = Sensor(size=(1, 1), pixels=(200, 200), read_noise=0.1, saturation=math.inf)
@@ -111,6 +112,44 @@ def test_image_is_the_picture_blurred_and_the_target_its_middle():
     assert torch.equal(own.target(picture)[:, 0], picture[:, 3:19, 3:19])
     flat = own.image(torch.full((22, 22), 0.4), distances)  # one picture for all distances
     torch.testing.assert_close(flat, torch.full((3, 1, 16, 16), 0.4), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("boundary", ["valid", "reflect"])
+def test_pixels_of_the_sensor_are_means_of_those_of_an_oversampled_picture(boundary):
+    """Kernels in the pixels of the picture; their sums over pixels of the sensor are kernels without oversampling."""
+    variables = Variables(read_lens("cooke_triplet"), "sensor")
+    how = {"sensor": NOISY, "fields": [0, 7], "boundary": boundary, "model": Gaussian(order=4)}
+    coarse = Camera(variables, Same(), pixels=5, **how)
+    fine = Camera(variables, Same(), pixels=15, oversampling=3, **how)
+    large = coarse.kernels([20e3, 30e3], [0, 1])
+    small = fine.kernels([20e3, 30e3], [0, 1])
+    torch.testing.assert_close(pixel_means(small, 3) * 9, large, atol=2e-5, rtol=0)
+    picture = torch.rand(2, 1, 30 + fine.margin, 30 + fine.margin, dtype=torch.float64)
+    image = fine.image(picture, [20e3, 30e3], [0, 1])
+    assert image.shape == (2, 1, 10, 10)
+    assert fine.target(picture).shape == (2, 1, 30, 30)
+    torch.testing.assert_close(image, pixel_means(blur(picture, small, boundary=boundary), 3))
+    assert fine.demosaiced(image, index=[0, 1]).shape == image.shape
+    with pytest.raises(OtherLens, match="window"):
+        coarse.load_state_dict(fine.state_dict())
+
+
+def test_the_transfer_function_of_an_oversampled_camera_has_the_mean_over_its_pixels():
+    """A picture of one frequency gives the sum of its aliases; haze stays at frequency 0."""
+    elements = phase_elements("singlet")
+    how = {"sensor_distance": 35.5, "sensor": NOISY, "pixels": 9, "boundary": "circular", "normalise": "haze"}
+    camera = Camera(PhaseVariables(elements[0]), Same(), object_distances=(1e3, 2e3), oversampling=2, **how)
+    picture = torch.rand(1, 1, 24, 18, dtype=torch.float64)
+    H = camera.transfer(camera.kernels([1e3]), (24, 18))
+    aliases = (torch.fft.fft2(picture) * H).unflatten(-1, (2, 9)).unflatten(-3, (2, 12)).mean((-4, -2))
+    torch.testing.assert_close(torch.fft.fft2(camera.image(picture, [1e3])), aliases)
+    assert H[..., 0, 0] == 1
+    with pytest.raises(ValueError, match="24 × 17 pixels: expected multiples of 2"):
+        camera.image(picture[..., :17], [1e3])
+    with pytest.raises(ValueError, match="oversampling 2"):
+        camera_error(camera, torch.ones(24, 24), [1e3])
+    with pytest.raises(ValueError, match="oversampling 0"):
+        Camera(camera.variables, Same(), oversampling=0, **how)
 
 
 def test_noise_is_that_of_the_sensor_and_of_the_number_of_the_picture():

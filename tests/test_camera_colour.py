@@ -50,6 +50,7 @@ from raytrace.tracing.scene import scene, symmetry
 SENSOR = rt.Sensor(size=(24.0, 16.0), pixels=(1200, 800), response="rgb", full_well=2e4, read_noise=5.0)
 RANGE = (8e3, 4e4)
 SETTINGS = CodesignSettings(
+    optimizer="adam",
     vary="thickness sensor curvature", hold="efl", wavelengths=(0.5876, 0.4861, 0.6563), wavelength_weights=(1.0,) * 3,
     network="u-net", depth=1, width=4, size=11, patch=16, batch=4, crops=2, epochs=2, start="rms", noise=0.02,
     sensor=(24.0, 16.0), pixel=0.02, near=8e3, far=4e4, focus_distance=13e3, spread="reciprocal",

@@ -49,6 +49,7 @@ DIFFERENT = {
     "--resume": "codesign finds its own runs",
     "--depth": "layers of a network, distances of points, and a map",
     "--sensor": "its distance from an element, and its size",
+    **dict.fromkeys(("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"),
 }
 
 
@@ -426,7 +427,7 @@ import builtins, io, pathlib, sys
 from raytrace import cli
 from raytrace.cli import commands
 builtins.open = io.open = pathlib.Path.read_text = None
-cli._version = str
+cli.version = str
 cli.build_parser()
 print(*sorted(name for name in sys.modules if name.startswith("raytrace.") and not name.startswith("raytrace.cli.")))
 """

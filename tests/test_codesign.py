@@ -1,5 +1,6 @@
 """Readings of the co-design paper: its focus distances at F/1.76, few rays, distances even in 1/z, decay of rates."""
 
+import copy
 import csv
 import dataclasses
 import json
@@ -8,24 +9,30 @@ from pathlib import Path
 import pytest
 import torch
 
+from raytrace.imaging import codesign
 from raytrace.imaging.closed_form import even_distances, scan
 from raytrace.imaging.codesign import (
+    LENS_STEPS,
+    adapted_error,
+    adapting_rate,
     closed_form,
-    default_settings,
     freeze_lens,
     initial_camera,
     lens_at_start,
     make_batch,
     optimise,
     pupil_points,
+    run_model,
+    take_turn,
 )
 from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.training import OtherSettings, Run
 from raytrace.psf_models import Gaussian, psf
 from raytrace.settings import CodesignSettings
+from raytrace.tracing.paraxial import first_order
 
-SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=2, batch=4, crops=2)
-FAST = CodesignSettings(f_number=1.76)
+SMALL = CodesignSettings(optimizer="adam", depth=2, width=2, patch=16, size=7, epochs=2, batch=4, crops=2)
+FAST = CodesignSettings(optimizer="adam", f_number=1.76)
 
 
 def spectrum_of_rows(rows, size):
@@ -62,7 +69,7 @@ def test_the_papers_focus_distances_appear_at_f_1_76(lens, textures, model, conj
 
 @pytest.mark.parametrize(("f_number", "metres"), [(1.74, 25.1), (1.80, 33.6)])
 def test_that_aperture_is_a_sharp_one_for_gaussian_drt(lens, textures, f_number, metres):
-    found = closed_form(lens, CodesignSettings(model="gaussian", f_number=f_number), textures)
+    found = closed_form(lens, dataclasses.replace(FAST, model="gaussian", f_number=f_number), textures)
     assert found.focus_paraxial_m == pytest.approx(metres, abs=0.1)
 
 
@@ -218,8 +225,108 @@ def test_a_folder_older_than_a_setting_has_its_default(tmp_path):
     given = dataclasses.asdict(SMALL)
     old = {name: value for name, value in given.items() if name not in ("rays", "decay", "spread", "sampling")}
     (tmp_path / "settings.json").write_text(json.dumps(old))
-    Run(tmp_path, given, usual=default_settings(SMALL))
+    Run(tmp_path, given, usual=SMALL.recorded({}))
     with pytest.raises(OtherSettings, match="decay was 'none', now 'cosine'"):
-        Run(tmp_path, {**given, "decay": "cosine"}, usual=default_settings(SMALL))
+        Run(tmp_path, {**given, "decay": "cosine"}, usual=SMALL.recorded({}))
     with pytest.raises(OtherSettings, match="decay was None"):
         Run(tmp_path, given)
+
+
+# ---------------------------------------------------------------- lens and network in turns
+
+IN_TURNS = dataclasses.replace(
+    SMALL, optimizer="lm", vary="curvature:1,4 sensor curvature:11", hold="efl", bounds="curvature_1:0.018..0.0185",
+    model="paraxial", pixel=0.02, size=7, f_number=5.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def behind_a_lens(lens, tmp_path, monkeypatch):
+    """A camera behind whose lens a network is trained, 8 steps; turns have three steps and one batch."""
+    monkeypatch.setattr(codesign, "LENS_STEPS", 3)
+    monkeypatch.setattr(codesign, "_BATCHES", 1)
+    own, run = initial_camera(lens, dataclasses.replace(IN_TURNS, width=4)), Run(tmp_path / "trained", {})
+    own.plan()
+    own.variables.requires_grad_(False)
+    for _ in optimise(own, dead_leaves(8, size=32), dataclasses.replace(IN_TURNS, width=4), run):
+        pass
+    return own
+
+
+def test_the_default_is_second_order_and_stored_runs_without_it_are_of_adam():
+    assert CodesignSettings().optimizer == "lm"
+    stored = CodesignSettings.recorded({"epochs": 3, "lens": "not a setting"})
+    assert (stored["optimizer"], stored["epochs"], stored["turns"]) == ("adam", 3, 0)
+    assert "lens" not in stored
+    assert CodesignSettings.recorded({"optimizer": "lm"})["optimizer"] == "lm"
+
+
+def test_turns_belong_to_steps_of_second_order(lens):
+    with pytest.raises(ValueError, match="turns 1 with optimizer 'adam': expected optimizer lm"):
+        initial_camera(lens, dataclasses.replace(SMALL, turns=1))
+
+
+def test_the_loss_of_a_network_that_adapts_has_its_own_derivative(behind_a_lens):
+    """Through the steps of the weights: central differences of the whole."""
+    own = behind_a_lens
+    own.network.double()
+    batches = [make_batch(dead_leaves(8, size=32), IN_TURNS, [0, 1, 2, 3], 9)]
+    curvature = own.variables.get_parameter("curvature_4").requires_grad_()
+    rate = adapting_rate(own, batches)
+    loss = adapted_error(own, batches, rate)
+    assert float(loss.detach()) < float(adapted_error(own, batches, 0.0).detach())
+    loss.backward()
+    ends, slope, step = [], float(curvature.grad), 1e-5
+    with torch.no_grad():
+        for sign in (1, -1):
+            curvature += sign * step
+            with torch.enable_grad():
+                ends.append(float(adapted_error(own, batches, rate).detach()))
+            curvature -= sign * step
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=2e-3)
+
+
+def test_a_turn_lowers_the_loss_under_conditions_and_resumes_bit_identically(behind_a_lens, tmp_path):
+    own = behind_a_lens
+    pictures, before = dead_leaves(8, size=32), copy.deepcopy(own.state_dict())
+    length = float(first_order(own.variables()).effective_focal_length)
+
+    def turned(folder, most):
+        own.load_state_dict(before)
+        own._steps = None
+        steps = take_turn(own, pictures, IN_TURNS, Run(tmp_path / folder, {}), 1)
+        return [record for _, (_, record) in zip(range(most), steps, strict=False)]
+
+    records = turned("whole", 99)
+    totals = [record["loss"] + record["penalty"] for record in records]
+    assert len(records) == 3
+    assert totals == sorted(totals, reverse=True)
+    assert totals[-1] < totals[0]
+    assert {record["turn"] for record in records} == {1.0}
+    assert float(first_order(own.variables()).effective_focal_length) == pytest.approx(length, rel=1e-9)
+    end = own.variables.numbers()
+    assert 0.018 <= end["curvature_1"] <= 0.0185
+    assert not any(parameter.requires_grad for parameter in own.variables.parameters())
+    turned("parts", 1)
+    assert turned("parts", 99) == records[1:]
+    assert own.variables.numbers() == end
+    assert (tmp_path / "parts" / "log.csv").read_text() == (tmp_path / "whole" / "log.csv").read_text()
+
+
+@pytest.mark.slow
+def test_a_run_in_turns_resumes_to_the_same_end(lens, tmp_path):
+    pictures = dead_leaves(8, size=32), dead_leaves(2, size=32, seed=1)
+    settings = dataclasses.replace(IN_TURNS, turns=2, epochs=1)
+
+    def run(folder, most):
+        steps = run_model(lens, *pictures, settings, tmp_path / folder, about={}, distances=(2e4,))
+        return [record for _, (_, _, record) in zip(range(most), steps, strict=False)]
+
+    whole = run("whole", 999)
+    per_epoch = 8 * settings.crops // settings.batch
+    assert len(whole) == (1 + 2) * per_epoch + 2 * LENS_STEPS + per_epoch
+    assert [record.get("turn") for record in whole[per_epoch : per_epoch + LENS_STEPS + 1]] == [1.0] * (LENS_STEPS + 1)
+    for most in (per_epoch + 2, LENS_STEPS, 999):
+        run("parts", most)
+    ends = [(tmp_path / folder / "outcome.json").read_text() for folder in ("whole", "parts")]
+    assert ends[0] == ends[1]

@@ -29,7 +29,7 @@ from raytrace.settings import CodesignSettings
 from raytrace.tracing.paraxial import paraxial_image_distance
 
 study = script("codesign_study")
-_LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
+_LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32 --optimizer adam"
 SMALL = tuple(_LITTLE.split(" "))
 PARAXIAL = (*SMALL, "--model", "paraxial")
 

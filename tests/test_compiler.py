@@ -265,6 +265,20 @@ def test_a_file_that_others_can_write_is_replaced(quick, tmp_path, capsys):
     assert len(quick) == 1
 
 
+def test_the_same_code_of_another_installation_is_not_compiled_again(quick, tmp_path):
+    digest = library._file_name().rpartition("-")[2]
+    other = tmp_path / f"{library._of_this_machine()}other-{digest}"
+    other.write_bytes(b"compiled before")
+    other.chmod(0o600)
+    kept = library.library.__wrapped__()
+    assert kept == tmp_path / library._file_name()
+    assert kept.read_bytes() == b"compiled before"
+    assert not quick
+    kept.unlink()
+    other.chmod(0o666)  # others can have changed it
+    assert library.library.__wrapped__().read_bytes() == b"new"
+
+
 def test_old_files_are_removed_and_those_of_others_kept(quick, tmp_path):
     """Gone: of this installation, older code; of this machine, or of nobody knows which, the long unused."""
     own, machine = library._of_this_installation(), library._of_this_machine()

@@ -13,9 +13,10 @@ from problems import vector
 import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.attained import attained
+from raytrace.optimization.conditions import WORDS, BadHold, conditions_of
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import WORDS, BadHold, Problem, conditions_of
+from raytrace.optimization.problem import Problem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Fields, is_round_about_axis
 from raytrace.system.optimization_data import Row, Vary

@@ -47,7 +47,7 @@ def paraxial_image(lens):
     return paraxial_image_distance(lens, lens.surfaces[0].thickness)
 
 
-SMALL = CodesignSettings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
+SMALL = CodesignSettings(optimizer="adam", depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3
 
 SIMULATED = ("paraxial", "fourier", "gaussian", "drt")

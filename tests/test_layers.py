@@ -14,15 +14,30 @@ from layers import FLOORS, MODULES, PACKAGE, package_of, parsed, statements
 #: Commands, whose imports may wait until they run.
 COMMANDS = re.compile(r"cli(\.|$)")
 
-#: The value of a lower layer is shown by a higher one: the only imports against the layers, inside its methods.
+#: The value of a lower layer is shown by a higher one, and a lens at another temperature has edges where rays reach:
+#: the only imports against the layers, inside methods.
 SHOWN_BY = {
-    "system.lens": ("tracing.lens_report", "analysis.layout"),
+    "system.lens": ("tracing.lens_report", "tracing.geometry", "analysis.layout", "optimization.conditions"),
+    "tracing.lens_report": ("optimization.attained",),
     "psf_models.result": ("psf_models.figures",),
     "optimization.optimized": ("optimization.optimized_figure",),
 }
 
 #: Libraries that are imported when they are first needed, inside functions.
-DEFERRED = ("matplotlib", "mpl_toolkits", "pandas", "anywidget", "starlette", "uvicorn", "colour", "ezdxf", "OCP")
+DEFERRED = (
+    "matplotlib",
+    "mpl_toolkits",
+    "pandas",
+    "anywidget",
+    "starlette",
+    "uvicorn",
+    "mcp",
+    "mcp_types",
+    "anyio",
+    "colour",
+    "ezdxf",
+    "OCP",
+)
 
 #: Modules that alone may import a library at their top.
 RESERVED = {
@@ -171,13 +186,20 @@ def test_physics_stays_in_torch(name):
 
 
 #: Distributions by the module that they install, where the names differ.
-DISTRIBUTIONS = {"PIL": "pillow", "OCP": "cadquery-ocp-novtk", "colour": "colour-science", "mpl_toolkits": "matplotlib"}
+DISTRIBUTIONS = {
+    "mcp_types": "mcp",
+    "anyio": "mcp",
+    "PIL": "pillow",
+    "OCP": "cadquery-ocp-novtk",
+    "colour": "colour-science",
+    "mpl_toolkits": "matplotlib",
+}
 
 
 def test_every_package_that_is_imported_is_declared():
-    """Viewer, measured cameras, DXF and STEP files have extras."""
+    """Viewer, measured cameras, DXF and STEP files, and the server of agents have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [name for extra in ("view", "colour", "cad") for name in project["optional-dependencies"][extra]]
+    extras = [name for extra in ("view", "colour", "cad", "mcp") for name in project["optional-dependencies"][extra]]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
     library = MODULES.values()
     roots = {name.split(".")[0] for path in library for name in imports(path)}

@@ -13,11 +13,12 @@ from scripts import script
 
 import raytrace as rt
 from raytrace.optimization import least_squares as paths
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, SolverOptions, SumOfSquares, least_squares
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimized_figure import optimize_report
-from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
-from raytrace.optimization.variables import design_variables, name_of
+from raytrace.optimization.problem import NoProblem, Problem, Recovery
+from raytrace.optimization.variables import design_variables
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
@@ -393,7 +394,7 @@ def test_a_file_reaches_the_known_merit_from_its_design_and_from_a_moved_one(kno
         assert found.merit_after <= 1.0001 * best
     free = design_variables(lens)
     model = free
-    factors = script("bench_optimise").factors(known, [name_of(one) for one in free.variables])
+    factors = script("bench_optimise").factors(known, [one.name for one in free.variables])
     moved = rt.optimize(model.lens_at(model.start * factors), seconds=20)
     assert moved.merit_before == pytest.approx(known["from_perturbed"]["mf_start"], rel=1e-3)
     assert moved.merit_after <= 1.01 * best

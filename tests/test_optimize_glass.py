@@ -14,6 +14,7 @@ from raytrace.cli import main
 from raytrace.materials.catalogs import shipped_catalog
 from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
+from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.glass_choice import (
     STATUSES,
     Choice,
@@ -27,7 +28,7 @@ from raytrace.optimization.glass_choice import (
 )
 from raytrace.optimization.least_squares import Sides, SumOfSquares, least_squares
 from raytrace.optimization.merit import merit_for
-from raytrace.optimization.problem import NoProblem, conditions_of
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.variables import design_variables, without_glass
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables

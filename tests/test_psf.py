@@ -459,3 +459,17 @@ def test_a_positive_field_lands_at_positive_y_at_f_tan_theta(model):
     assert float(result.centroid[0, 0, 0]) == pytest.approx(0.0, abs=1e-12)
     middle = result.kernel[0, 0, 6:15, 6:15].sum()
     assert float(middle) > 0.5 * float(result.energy)
+
+
+@pytest.mark.parametrize("model", [Gaussian(order=2), DRT(order=0)])
+def test_each_object_distance_may_have_its_own_field(model):
+    lens, window = rt.read_lens("cooke_triplet"), {"pixel": 0.02, "size": 7}
+    distances, fields = torch.tensor([2e3, 9e3]), torch.tensor([[[0.0], [3.0]], [[10.0], [-5.0]]], dtype=torch.float64)
+    pairs = rt.psf(lens, model, fields=fields, object_distances=distances, **window)
+    for k in range(2):
+        alone = rt.psf(lens, model, fields=fields[:, k], object_distances=distances[k : k + 1], **window)
+        assert float((pairs.kernel[k] - alone.kernel[0]).abs().max()) < 1e-12
+        assert pairs.document()["results"][k]["field"] == fields[:, k, 0].tolist()
+    assert pairs.columns()["field_y"].tolist() == [[10.0], [-5.0]]
+    with pytest.raises(ValueError, match=r"expected \(2, F\), or \(2, 3, F\)"):
+        rt.psf(lens, model, fields=fields, object_distances=[2e3, 9e3, 1e4], **window)

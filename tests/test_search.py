@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
@@ -13,20 +14,23 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.edit.surfaces import without
 from raytrace.materials.glass import is_air
-from raytrace.optimization.curriculum import Plan, Step
+from raytrace.optimization.conditions import conditions_of
+from raytrace.optimization.curriculum import Growth, Plan, Step
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
 from raytrace.optimization.one_element import thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
-from raytrace.optimization.problem import NoProblem, conditions_of
-from raytrace.optimization.removal import Removal, without_element
+from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.removal import Removal
 from raytrace.optimization.saddle_points import Place, enlarged, saddle
 from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
     BadSearch,
     Journal,
+    Minimum,
     SearchProblem,
     SearchStopped,
     TaskResult,
@@ -320,7 +324,7 @@ def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
     x = np.clip(removal._whole.model.start, stage.lower, stage.upper)
     thin, reduced = removal._whole.model.lens_at(x), removal.reduced
     assert [surface.glass.name for surface in reduced.model.lens.surfaces].count("SK4") == 2
-    assert torch.allclose(rt.spot(without_element(thin, 3)).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
+    assert torch.allclose(rt.spot(without(thin, 3, 4)[0]).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
     assert len(reduced.model.variables) == len(asked.model.variables) - 4
     assert reduced.whole.merit(reduced.whole.evaluated(removal._without(x)), removal._without(x)) == pytest.approx(
         stage.problem.merit(stage.problem.evaluated(x), x), rel=1e-9
@@ -329,10 +333,10 @@ def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
 
 def test_the_stop_and_the_image_keep_their_places(best_triplet):
     _, lens = best_triplet
-    assert (lens.stop, without_element(lens, 6).stop, without_element(lens, 1).stop) == (5, 5, 3)
+    assert (lens.stop, without(lens, 6, 7)[0].stop, without(lens, 1, 2)[0].stop) == (5, 5, 3)
     for k in (1, 3, 6):
         total = sum(float(surface.thickness) for surface in lens.surfaces[1:-1])
-        shorter = sum(float(surface.thickness) for surface in without_element(lens, k).surfaces[1:-1])
+        shorter = sum(float(surface.thickness) for surface in without(lens, k, k + 1)[0].surfaces[1:-1])
         gone = sum(float(surface.thickness) for surface in lens.surfaces[1:3]) if k == 1 else 0.0
         assert shorter == pytest.approx(total - gone, rel=1e-12)
 
@@ -393,7 +397,7 @@ def phone_plates():
 
 
 def test_a_step_has_its_part_of_aperture_and_field_and_its_terms(phone_plates):
-    plan = Plan("phone", phone_plates, None, None, "efl=6 chief_ray_angle<=30", None)
+    plan = Plan("phone", phone_plates, None, None, ["efl=6", "chief_ray_angle<=30"], None)
     first = plan.problem(phone_plates, Step(0.4, 0.5, 4))
     last = plan.problem(phone_plates, Step(1.0, 1.0, 9, ("conic", "a4"), 6))
     assert float(rt.first_order(first.model.lens).entrance_pupil_diameter) == pytest.approx(0.4 * 3)
@@ -424,6 +428,21 @@ def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
         rt.search(phone_plates, kind="phone", insert=True)
     with pytest.raises(NoProblem, match="a merit function of its own"):
         rt.search(phone_plates, kind="phone", hold="efl=6", merit="wavefront")
+
+
+def test_the_step_at_which_a_curriculum_ends_is_said(phone_plates, monkeypatch):
+    plan = Plan("phone", phone_plates, None, None, ["efl=6"], None)
+    start = plan.problem(phone_plates, plan.curriculum.steps[0])
+    minimum = Minimum(TaskResult(0.0, 0.0, 1.0, 0.0, start.model.start), "3, followed", 0.0)
+    growth = Growth(plan, SimpleNamespace(through=lambda progress: None, each=lambda: [(start, minimum)]),
+                    Journal(None, {}, np.inf))  # fmt: skip
+    monkeypatch.setattr(Growth, "_is_far", lambda *args: False)
+    monkeypatch.setattr(Growth, "_descended", lambda self, task, step: TaskResult(2.0, 0.0, 1.0, 0.0, task.model.start))
+    growth.through(None)
+    assert growth.each() == []
+    assert growth.ended == [
+        "from minimum 3, followed: failing rays in 2 rows at 40% of the aperture and 50% of the field"
+    ]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 import raytrace as rt
 from raytrace.materials.glass import abbe_number, nd
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import DesignVariables, VariedGlass, bounds_of, design_variables, name_of
+from raytrace.optimization.variables import DesignVariables, VariedGlass, bounds_of, design_variables
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables
 
@@ -20,7 +20,7 @@ def zoom(lens):
 
 
 def names(lens, vary):
-    return [name_of(one) for one in design_variables(lens, vary).variables]
+    return [one.name for one in design_variables(lens, vary).variables]
 
 
 def test_a_kind_alone_means_every_surface_where_it_makes_sense(lens):
@@ -62,7 +62,7 @@ def test_pose_and_shape_of_the_image_vary(lens):
     words = "tilt:12 decentre:12 tilt_z:12 z:12 curvature:12 conic:12"
     lens = lens.replace(12, tilt_x=1.0, x=0.1, curvature=1e-3)
     found = design_variables(lens, words)
-    assert [name_of(one) for one in found.variables][:4] == ["tilt_x_12", "tilt_y_12", "x_12", "y_12"]
+    assert [one.name for one in found.variables][:4] == ["tilt_x_12", "tilt_y_12", "x_12", "y_12"]
     model = DesignVariables(found.lens, found.variables)
     rays = [rt.system.Row(name, (12, 1), (0.3, 1.0, 0.2, 0.5), weight=1.0) for name in ("REAX", "REAY", "REAZ", "RAID")]
     evaluation = Evaluation(model, [*rays, rt.system.Row("OPDC", (0, 1), (0.0, 1.0, 0.2, 0.5), weight=1.0)])
@@ -121,7 +121,7 @@ def test_solves_and_pickups(lens):
     (solve,) = design_variables(lens, "curvature sensor=marginal_height(0)").solves
     assert (solve.surface, solve.quantity, solve.numbers) == (11, "thickness", (0.0, 0.0))
     found = design_variables(lens, "curvature curvature:4=-curvature:3")
-    assert "curvature_4" not in [name_of(one) for one in found.variables]
+    assert "curvature_4" not in [one.name for one in found.variables]
     both = design_variables(lens, "curvature thickness:5,7=thickness:2").solves
     assert [(one.surface, one.source) for one in both] == [(5, 2), (7, 2)]
 
@@ -188,7 +188,7 @@ def test_without_variables_in_the_file_words_are_asked_for(lens):
 def test_bounds_by_kind_surface_and_configuration(zoom):
     found = design_variables(zoom, "thickness:5,6 sensor curvature:3 tilt:4")
     low, high = bounds_of(found.lens, found.variables, "thickness:2..15 thickness_6@2:14..20 sensor:50,60 tilt:-1..1")
-    ranges = dict(zip(map(name_of, found.variables), zip(low, high, strict=True), strict=True))
+    ranges = dict(zip((v.name for v in found.variables), zip(low, high, strict=True), strict=True))
     inf = np.inf
     assert ranges == {
         "thickness_5": (2, 15),

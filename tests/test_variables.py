@@ -26,7 +26,7 @@ from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.variables import DesignVariables, design_variables, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.parameter_paths import BadLimits, BadVariables, parameter_paths, parse_bounds, parse_range
@@ -410,7 +410,7 @@ def test_variable_syntax_is_that_of_optimize():
     lens = read_lens("cooke_triplet")
     free = design_variables(lens, "curvature thickness a4:3 tilt:2 index:1")
     variables = Variables(lens, "curvature thickness a4:3 tilt:2 index:1")
-    assert set(variables.names) == {name_of(one) for one in free.variables}
+    assert set(variables.names) == {one.name for one in free.variables}
     with torch.no_grad():
         variables.get_parameter("tilt_x_2").add_(1.0)
         variables.get_parameter("a4_3").add_(1e-3)
@@ -454,7 +454,7 @@ def test_rays_and_pupils_have_derivatives_by_the_system_aperture(case):
     rows = [Row("REAY", (surface, 1), (0.0, *point), weight=1.0) for surface in (5, 11) for point in POINTS]
     rows += [Row("EPDI", weight=1.0), Row("WFNO", weight=1.0)]
     model = DesignVariables(lens, tuple(Vary(*at) for at in ((0, "aperture"), (4, "thickness"), (5, "thickness"))))
-    assert [name_of(one) for one in model.variables] == ["aperture", "thickness_4", "thickness_5"]
+    assert [one.name for one in model.variables] == ["aperture", "thickness_4", "thickness_5"]
     evaluation = Evaluation(model, rows)
     found = evaluation(model.start, derivatives=True)
     assert not found.lost.any()

@@ -307,6 +307,23 @@ def test_conditions_and_comparison(page):
     assert page.locator(".was").count() > 3
 
 
+def test_conditions_of_the_lens_are_added_edited_switched_off_and_removed(page):
+    words = lambda: page.eval_on_selector_all(".held input[type=text]", "all => all.map((one) => one.value)")  # noqa: E731
+    page.fill('[aria-label="new condition"]', "efl=100 total_track<=120")
+    changed(page, lambda: page.press('[aria-label="new condition"]', "Enter"))
+    assert words() == ["efl=100", "total_track<=120", ""]
+    assert page.inner_text('[data-condition-value="efl=100"]') == "101.181, not met"
+    assert page.inner_text('[data-condition-value="total_track<=120"]') == "116.485"
+    changed(page, lambda: page.uncheck('[aria-label="condition 2 is met"]'))
+    assert page.inner_text('[data-condition-value="total_track<=120"]') == "off"
+    page.fill('[aria-label="condition 1"]', "elf=99")
+    changed(page, lambda: page.press('[aria-label="condition 1"]', "Enter"))
+    assert "did you mean" in page.inner_text(".message") or "nothing to hold" in page.inner_text(".message")
+    assert words()[0] == "efl=100"
+    changed(page, lambda: page.click('[aria-label="remove condition 2"]'))
+    assert words() == ["efl=100", ""]
+
+
 def test_save_writes_only_where_it_is_told(page, folder):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     changed(page, lambda: typed(page, "thickness:2", "13.25"))

@@ -490,6 +490,29 @@ def test_a_file_of_conditions_alone_is_optimised_for_its_spots(triplet):
     assert float(rt.first_order(session.state.lens).effective_focal_length) == pytest.approx(100, rel=1e-6)
 
 
+def test_conditions_are_added_edited_switched_off_and_met(triplet):
+    session = Session(triplet)
+    shown = session.answer({"type": "condition", "words": "efl=100 total_track<=118"})["prescription"]["conditions"]
+    assert [(one["words"], one["on"], one["met"]) for one in shown] == [
+        ("efl=100", True, False), ("total_track<=118", True, True)
+    ]  # fmt: skip
+    assert shown[0]["reached"] == pytest.approx(float(rt.first_order(triplet).effective_focal_length), rel=1e-12)
+    session.answer({"type": "condition", "number": 1, "on": False})
+    session.answer({"type": "condition", "number": 0, "words": "efl=99"})
+    assert [str(one) for one in session.state.lens.conditions] == ["off:total_track<=118", "efl=99"]
+    session.answer({"type": "vary", "quantity": "curvature", "surface": 1, "on": True})
+    session.answer({"type": "vary", "quantity": "curvature", "surface": 4, "on": True})
+    session.answer({"type": "optimise"})
+    reply = progress(session, ended=True)
+    assert reply["message"] == ""
+    assert float(rt.first_order(session.state.lens).effective_focal_length) == pytest.approx(99, rel=1e-6)
+    assert [one["words"] for one in reply["prescription"]["conditions"]] == ["total_track<=118", "efl=99"]
+    assert session.answer({"type": "condition", "number": 5, "remove": True})["message"].startswith("condition 6")
+    assert "did you mean efl" in session.answer({"type": "condition", "words": "eflx=1"})["message"]
+    left = session.answer({"type": "condition", "number": 1, "remove": True})["prescription"]["conditions"]
+    assert [one["words"] for one in left] == ["total_track<=118"]
+
+
 def test_a_failure_of_an_optimisation_is_one_message(triplet):
     session = Session(triplet)
     session.answer({"type": "vary", "quantity": "curvature", "surface": 1, "on": True})

@@ -29,7 +29,7 @@ from raytrace.io import read_lens
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.optimize import optimize
 from raytrace.optimization.problem import Problem
-from raytrace.optimization.variables import DesignVariables, design_variables, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
@@ -88,7 +88,7 @@ def _of_file(name: str, bar) -> FileRow:
     known = _oracle(Path(name))
     free = design_variables(lens)
     model = free
-    moved = model.lens_at(model.start * factors(known, [name_of(variable) for variable in free.variables]))
+    moved = model.lens_at(model.start * factors(known, [variable.name for variable in free.variables]))
     stored, from_moved = (optimize(start, seconds=MOST) for start in (lens, moved))
     bar.update(1)
     return FileRow(

@@ -60,7 +60,8 @@ from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 
 BASE = CodesignSettings(
-    vary="thickness sensor curvature", hold="efl buildable", spread="reciprocal", start="rms", noise=0.02,
+    vary="thickness sensor curvature", hold="efl buildable", optimizer="adam", spread="reciprocal",
+    start="rms", noise=0.02,
     wavelengths=(0.5876, 0.4861, 0.6563), wavelength_weights=(1.0, 1.0, 1.0), network="u-net", depth=2, width=16,
     size=21, patch=64, batch=8, crops=1, rate_network=2e-3, rate_optics=5e-3, decay="cosine",
 )  # fmt: skip

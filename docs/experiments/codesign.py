@@ -3,7 +3,8 @@
     python docs/experiments/codesign.py double_gauss --data DIR -o FOLDER --docs docs
     python docs/experiments/codesign.py double_gauss --data DIR -o F1.9 --docs docs --page codesign_f1.9 --f-number 1.9
 
-Settings are those of `raytrace codesign`. The page of the double Gauss compares the results with the published study.
+Settings are those of `raytrace codesign`, by default with lens and network trained together (`--optimizer adam`), as in
+the published study, with which the page of the double Gauss compares the results.
 """
 
 import argparse
@@ -52,7 +53,6 @@ from raytrace.imaging.codesign import (
     OPTIMUM_COLUMNS,
     STEPS,
     Optimum,
-    default_settings,
     initial_camera,
     lens_at_start,
     make_batch,
@@ -307,7 +307,7 @@ def compare(arguments: argparse.Namespace) -> None:
     steps = experiment.steps_per_epoch  # refuses pictures that do not fill a batch
     common = {name: value for name, value in dataclasses.asdict(settings).items() if name not in ("model", "seed")}
     # Refuses a folder of other settings, another lens or other pictures.
-    Run(study, {**common, **experiment.about}, usual=default_settings(settings))
+    Run(study, {**common, **experiment.about}, usual=settings.recorded({}))
     rows, seeds = _rows_and_seeds(arguments, study)
     if not arguments.report_only:
         # Seeds outside: a study that is stopped has compared as many models as possible.
@@ -477,6 +477,7 @@ def _scan(
 
 def options(parser: argparse.ArgumentParser) -> None:
     codesign.experiment_options(parser)
+    parser.set_defaults(optimizer="adam")
     group = parser.add_argument_group("study")
     group.add_argument(
         "--models",

@@ -37,7 +37,7 @@ from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 
 BASE = CodesignSettings(
-    vary="curvature:1-3,5,7,9-11 sensor", hold="efl", noise=0.02, width=16, batch=16, patch=32,
+    vary="curvature:1-3,5,7,9-11 sensor", hold="efl", optimizer="adam", noise=0.02, width=16, batch=16, patch=32,
     start="57.59", rate_network=2e-3, rate_optics=1e-4, decay="cosine", center="centroid", cameras=16,
 )  # fmt: skip
 #: What cameras are built with: (grade, refocus).

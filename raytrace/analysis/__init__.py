@@ -13,6 +13,7 @@
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
+| thermal                                     | focus, spot and MTF over temperature                           |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
 | sag                                         | sag, slope, aspheric departure, best-fit sphere of a surface   |

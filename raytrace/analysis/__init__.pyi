@@ -17,4 +17,5 @@ from raytrace.analysis.rms import rms_over_field as rms_over_field
 from raytrace.analysis.sag_table import sag as sag
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.spot_diagram import spot as spot
+from raytrace.analysis.thermal import thermal as thermal
 from raytrace.analysis.wavefronts import wavefront as wavefront

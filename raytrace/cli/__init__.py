@@ -51,6 +51,8 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")  # -3,4 and -1e-3 are no options
 
     def error(self, message: str) -> NoReturn:
+        if message.endswith("is not a number"):
+            message += " (LENS goes before the options)"
         print(f"raytrace: error: {message}; see `{self.prog} --help`", file=sys.stderr)
         raise SystemExit(2)
 
@@ -95,7 +97,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="raytrace", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
+    parser.add_argument("--version", action="version", version=f"raytrace {version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS:
         command.add_to(commands, with_options=only in (None, command.name))
@@ -112,6 +114,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = build_parser(next((word for word in words if not word.startswith("-")), "")).parse_args(words)
     except SystemExit as stop:  # argparse printed its help or its usage error
         return stop.code if isinstance(stop.code, int) else 2
+    return execute(arguments)
+
+
+def execute(arguments: argparse.Namespace, report: Callable[..., object] | None = None) -> int:
+    """Carry out a parsed command line, as `main` does. report: of its progress (`progress.heartbeat`)."""
     with warnings.catch_warnings(), in_command(arguments.flags):
         warnings.simplefilter("always")
         shown: set[type[Warning]] = set()
@@ -119,11 +126,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _shower(shown, of_result)
         try:
             from raytrace.budget import within
+            from raytrace.cli.commands import function
             from raytrace.cli.progress import heartbeat
-            from raytrace.cli.runner import carry_out
 
-            with heartbeat(arguments.command), within(getattr(arguments, "max_bytes", None)):
-                code = carry_out(arguments)
+            with heartbeat(arguments.command, report), within(getattr(arguments, "max_bytes", None)):
+                code = function(arguments.run.carried_out_by)(arguments)
             for words in of_result:
                 print(words, file=sys.stderr)
             return 1 if any(issubclass(category, NotWritten) for category in shown) else code
@@ -199,7 +206,7 @@ def _shower(shown: set[type[Warning]], of_result: list[str]) -> Callable[..., No
     return show
 
 
-def _version() -> str:
+def version() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:

@@ -18,9 +18,10 @@ from raytrace.settings import GRADES, MODELS, CodesignSettings
 
 SUMMARY = "optimise a lens together with a restoration network"
 DESCRIPTION = """\
-Train the sensor distance (or any variables) of a lens together with a network that restores its images. Step 1 trains
-both with the PSFs of one model; step 2 freezes the lens and continues to train the network on PSFs of traced rays, for
-as many epochs.
+Optimise the sensor distance (or any variables) of a lens for a network that restores its images. Step 1 brings the lens
+to the optimum of the closed form by steps of second order, and trains the network behind it, with the PSFs of one model
+(--optimizer adam trains both together); step 2 continues to train the network on PSFs of traced rays, for as many
+epochs.
 
 Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
 (Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
@@ -32,13 +33,13 @@ EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral -o learned.zmx
   raytrace codesign double_gauss --model gaussian --data pictures -o run --plot loss.png
   raytrace codesign double_gauss --start spectral --bounds sensor:57..58 --data pictures -o from_closed_form
-  raytrace codesign cooke_triplet --optimizer lm --vary curvature sensor --hold efl --field 0 8 12 --data pictures -o lm
+  raytrace codesign cooke_triplet --vary curvature sensor --hold efl --field 0 8 12 --data pictures -o lm
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign cooke_triplet --sensor 24x16 --vary thickness curvature --hold efl buildable --preset unet -o colour
-  raytrace codesign double_gauss --as-built --grade commercial --vary sensor curvature:1,11 --data pictures -o built
-  raytrace codesign double_gauss --grade commercial --vary sensor curvature:1,11 --data pictures -o nominal
+  raytrace codesign double_gauss --as-built --grade commercial --vary curvature:1,11 sensor --optimizer adam -o built
+  raytrace codesign double_gauss --grade commercial --vary curvature:1,11 sensor --optimizer adam -o nominal
   raytrace codesign cooke_triplet --settings run/settings.json --set rate_optics=5e-4 decay=cosine -o again"""
 
 #: The options by the field of `CodesignSettings`.
@@ -60,9 +61,14 @@ ROWS = {
         choices=("sag", "blur"),
     ),
     "optimizer": option(
-        "of the lens: adam (default), together with the network, or lm: steps of second order to the optimum of the "
-        "closed form, from the best spots and from the file's lens, behind which the network is trained",
+        "of the lens: lm (default), steps of second order to the optimum of the closed form, from the best spots and "
+        "from the file's lens, behind which the network is trained; or adam, together with the network",
         choices=("adam", "lm"),
+    ),
+    "turns": option(
+        "after the network is trained, so many times in turns: steps of second order of the lens, for the loss of a "
+        "network that adapts to it, then the network again for --epochs",
+        type=count,
     ),
     "relearn": option(
         "epochs of step 1 again, with the nearest catalog glasses in place of varied ones (index:1 abbe_number:1)",
@@ -156,8 +162,8 @@ ROWS = {
         choices=("auto", "float32", "bfloat16"),
     ),
     "as_built": option(
-        "train on perturbed lenses, another one for each patch: lens and network learn to bear the errors of "
-        "manufacture; the tolerances are those of --grade and --limits, or of the file"
+        "train on perturbed lenses, another one for each patch: the network, and with --optimizer adam the lens, learn "
+        "to bear the errors of manufacture; the tolerances are those of --grade and --limits, or of the file"
     ),
     "grade": option(
         "tolerances of a published grade (default: those of the file); without --as-built the training is nominal, and "
@@ -188,7 +194,7 @@ _OF_ONE_RUN = ("model", "seed")
 #: Options that the help page shows; settings of a file, or of --set, are all of them.
 _SHOWN = (
     *("vary", "bounds", "hold", "start", "f_number", "wavelengths", "near", "far", "fields", "sensor", "as_built"),
-    *("grade", "optimizer", "epochs", "batch", "noise"),
+    *("grade", "optimizer", "turns", "epochs", "batch", "noise"),
 )
 
 

@@ -19,6 +19,7 @@ from raytrace.cli.settings import given_settings
 from raytrace.files import write_json
 from raytrace.imaging.codesign import (
     LENS,
+    LENS_STEPS,
     STEPS,
     Optimum,
     Outcome,
@@ -180,8 +181,7 @@ def _wavelengths(arguments: argparse.Namespace, given: Mapping) -> dict[str, Seq
 
 def recorded_settings(path: Path) -> CodesignSettings:
     """The settings in a `settings.json`, with defaults for missing ones."""
-    known = {field.name for field in dataclasses.fields(CodesignSettings)}
-    return read_settings(CodesignSettings, {name: value for name, value in read_json(path).items() if name in known})
+    return read_settings(CodesignSettings, CodesignSettings.recorded(read_json(path)))
 
 
 def faster_precision(settings: CodesignSettings, *, size: int = 64, count: int = 4) -> str:
@@ -225,7 +225,8 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
     """Train both steps of a run, or their remaining epochs, with a bar and a line for every epoch."""
     per_epoch = experiment.steps_per_epoch if len(experiment.train) else 0  # of a finished run
     focus = focus_of(experiment.lens, settings)
-    length, losses, bar = (settings.epochs + settings.relearn) * per_epoch, [], None
+    epochs = {STEPS[0]: settings.epochs * (1 + settings.turns) + settings.relearn, STEPS[1]: settings.epochs}
+    length, losses, bar = epochs[STEPS[0]] * per_epoch + settings.turns * LENS_STEPS, [], None
 
     def testing(batches: Sequence[int]) -> Iterator[int]:
         for number, first in enumerate(batches, 1):
@@ -247,16 +248,21 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
                     say(f"{label}: resumes after step {done} of {total}")
                 bar = progress(total, what=label, initial=done)
             losses.append(record["loss"])
-            words = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
+            turn = int(record.get("turn", 0))
+            words = f", turn {turn} of {settings.turns}" if turn else ""
+            words += f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
             if "sensor" in record:
                 words += f", sensor {record['sensor']:.4f} mm"
                 words += f", focus {focus(record['sensor']):.1f} m" if focus else ""
             bar.set_postfix_str(f"{name}, loss {record['loss']:.4f}{words}", refresh=False)
             bar.update()
-            if (step + 1) % per_epoch == 0:
-                epochs = settings.epochs + (settings.relearn if name == STEPS[0] else 0)
-                epoch = f"epoch {(step + 1) // per_epoch} of {epochs}"
-                bar.write(f"raytrace: {label}, {name}, {epoch}: loss {sum(losses) / len(losses):.4f}{words}")
+            epoch, rest = divmod(step + 1 - turn * LENS_STEPS, per_epoch)
+            if "lens_step" in record:
+                bar.write(f"raytrace: {label}, lens step {record['lens_step']:.0f}: loss {record['loss']:.4f}{words}")
+                losses.clear()
+            elif rest == 0:
+                progressed = f"epoch {epoch} of {epochs[name]}"
+                bar.write(f"raytrace: {label}, {name}, {progressed}: loss {sum(losses) / len(losses):.4f}{words}")
                 losses.clear()
     finally:
         if bar is not None:
@@ -389,8 +395,10 @@ def _train(arguments: argparse.Namespace) -> None:
     result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")
     if lens_file and not share().rank:
         write_lens(read_lens(folder / LENS, catalogs=experiment.catalogs), lens_file, catalogs=experiment.catalogs)
+    in_turns = [f"network_{turn}" for turn in range(1, settings.turns + 1)]
     curves: dict[str, Sequence[float]] = {
-        f"step {k}": [row["loss"] for row in read_log(folder / name / "log.csv")] for k, name in enumerate(STEPS, 1)
+        f"step {k}": [row["loss"] for name in names for row in read_log(folder / name / "log.csv")]
+        for k, names in enumerate(([STEPS[0], *in_turns], [STEPS[1]]), 1)
     }
     _present(
         CodesignResult(experiment, result, curves),

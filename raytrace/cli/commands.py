@@ -5,6 +5,8 @@ parameter. A new command is a new row. A command that does more than call the fu
 """
 
 import argparse
+import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -34,6 +36,7 @@ from raytrace.cli.options import (
     switch,
 )
 from raytrace.cli.types import (
+    Reader,
     count,
     count_or_all,
     count_or_none,
@@ -60,7 +63,8 @@ class Command:
     """One command.
 
     examples: the last part of its help page; options: names of rows of OPTIONS, further rows, and groups of both; run:
-    module and function that return the result, where it is more than a call of the public function `verb` with a lens.
+    module and function that return the result, where it is more than a call of the public function `verb` with a lens;
+    carried_out_by: module and function that open the lens, run the command, and print and save its result.
     """
 
     name: str
@@ -70,6 +74,7 @@ class Command:
     options: tuple[str | Adder, ...]
     run: str | None = None
     subcommands: tuple["Command", ...] = ()
+    carried_out_by: str = "cli.runner:carry_out"
 
     @property
     def verb(self) -> str:
@@ -99,13 +104,26 @@ class Command:
             parser.set_defaults(run=self, flags=flags, suffix="")
 
 
+def function(place: str) -> Callable:
+    """The function that a row names as module:name."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(f"raytrace.{module}"), name)
+
+
 def _command(
-    name: str, summary: str, description: str, examples: str, /, *options: str | Adder, run: str | None = None
+    name: str,
+    summary: str,
+    description: str,
+    examples: str,
+    /,
+    *options: str | Adder,
+    run: str | None = None,
+    carried_out_by: str = Command.carried_out_by,
 ) -> Command:
     """A row; examples: one a line, without `raytrace NAME`."""
     start = f"  raytrace {name.replace('wave-', 'wave ')} "
     text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
-    return Command(name, summary, description, text, options, run)
+    return Command(name, summary, description, text, options, run, carried_out_by=carried_out_by)
 
 
 def _of_module(name: str, module: ModuleType, run: str) -> Command:
@@ -117,6 +135,35 @@ _WAVE_FIGURES = {
     "caustic": "the light behind the element, over distance and radius,",
     "encircled": "the fraction of the light within a radius",
 }
+
+
+class Step(argparse.Action):
+    """An edit: its name and its words are appended to `steps`, in the order of the command line."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, word: str | None = None
+    ) -> None:
+        namespace.steps = [*getattr(namespace, "steps", ()), (self.dest, values)]
+
+
+#: The edits of `raytrace edit`: name, reader, metavar, count of words, help.
+EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, str], ...] = (
+    ("at", None, "SURFACES", None, "the surfaces of the edits behind it that name none"),
+    ("scale", positive_finite, "FACTOR", None, "all lengths, and all that depends on them, by a factor"),
+    ("efl", finite, "MM", None, "scale to an effective focal length"),
+    ("reverse", None, "SURFACES", "*", "turn the lens around, or a group of surfaces; object and image stay"),
+    ("swap_conjugates", None, "", 0, "turn the lens around with object and image: rays are traced backwards"),
+    ("insert", None, "BEFORE ROW", "+", "surfaces before one, a row each, as radius=50,thickness=4,glass=N-BK7; "
+     "without a row a plane"),
+    ("delete", None, "SURFACES", "*", "take surfaces out; all others stay in their places"),
+    ("join", None, "SURFACES", "*", "take out surfaces that do nothing, and add the thicknesses"),
+    ("split", None, "SURFACES", "*", "cut an element into two of the same power together: share=0.5 of the thickness, "
+     "gap=0 mm, curvature=0 of the first face; of one surface: a meniscus without thickness before it"),
+    ("bend", None, "SURFACES X", "+", "the element of the shape factor X and the same power; keep=thin: its power "
+     "without thickness"),
+    ("rename", None, "TITLE", None, "the title"),
+    ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
+)  # fmt: skip
 
 #: Subcommands of `raytrace wave`.
 WAVE_COMMANDS = (
@@ -167,6 +214,17 @@ COMMANDS = (
         *LENS, CONDITIONS, TABLE,
     ),
     _command(
+        "lenses",
+        "list the shipped lenses and the files of a folder",
+        "List the names and titles of the shipped lenses, and of a folder the files that commands read (lens files, "
+        "glass catalogs, checkpoints) and its folders.",
+        """
+        lenses
+        --json""",
+        Option("folder", file_name, "FOLDER", "folder to list", flag="folder", nargs="?", default="."),
+        "json", run="cli.runs:lenses",
+    ),
+    _command(
         "check",
         "import report of a lens file",
         "Print the import report: every keyword read, ignored (with the reason) or unknown, and the catalog of each "
@@ -188,6 +246,35 @@ COMMANDS = (
         Option("target", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", flag="target"),
         "catalog", "json", row("strict", "fail on anything unknown or assumed in IN"), "configuration", "substitute",
         "max_bytes", run="cli.runs:convert",
+    ),
+    _command(
+        "edit",
+        "scale, reverse, split, bend, insert and delete",
+        """\
+Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
+have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
+is the element, or the cemented group, that begins there.
+
+Stop, solves, pickups, configurations, merit rows and tolerances follow with their numbers; what refers to a surface
+that is gone is left out and named in a warning. Focal length, track and F-number before and after are printed.""",
+        """
+        double_gauss --scale 2 -o large.zmx
+        cooke_triplet --efl 50 --rename "Cooke triplet 50 mm" -o triplet50.zmx
+        cooke_triplet --reverse -o reversed.zmx
+        double_gauss --reverse 3-5 -o flipped.zmx
+        relay.zmx --swap-conjugates -o backwards.zmx
+        cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
+        lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
+        lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
+        lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx""",
+        *LENS,
+        group(
+            "edits, in the order given",
+            *(Option(name, reader, metavar, help, nargs=nargs, action=Step)
+              for name, reader, metavar, nargs, help in EDITS),
+        ),
+        Option("output", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", "-o --output",
+               required=True), run="cli.runs:edit",
     ),
     _command(
         "layout",
@@ -399,6 +486,20 @@ COMMANDS = (
         *LENS, CONDITIONS, Option("port", count, "N", "port of the server (default: a free one)"),
         switch("browser", "print the address, open no browser", flag="--no-browser", default=True),
         run="cli.runs:view",
+    ),
+    _command(
+        "mcp",
+        "let agents use the tracer",
+        "Serve agents (language models) by the Model Context Protocol over standard input and output: tools that "
+        "read, analyse, draw, optimise, search, tolerance and convert lenses. Files are read and written below one "
+        "folder only, and replaced only by request. A client starts this command. Needs the extra: pip install "
+        "'raytrace[mcp]'.",
+        """
+        --folder lenses
+        --folder . --json""",
+        Option("folder", file_name, "DIR", "folder below which files are read and written", required=True),
+        row("json", "print the tools with the schemas of their parameters as one JSON document, and serve none"),
+        carried_out_by="agents.server:carry_out",
     ),
     _command(
         "trace",
@@ -721,6 +822,21 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         singlet --wavelength 0.45 0.65 --json""",
         *LENS, CONDITIONS, plot("the curve"), TABLE,
         row("samples", "wavelengths of the curve", default=101),
+    ),
+    _command(
+        "thermal",
+        "focus, focal length, spot and MTF over temperature",
+        "Focal length, back focal distance, focus shift, RMS spot radius and the lowest MTF of all fields over "
+        "temperature, with the sensor fixed in the mount, by default aluminium, and refocused.",
+        """
+        double_gauss --range -20 60 --mount aluminium --plot thermal.png
+        cemented_achromat --mount invar --modulation-frequency 40 --json
+        lens.zmx --range -40 85 --samples 6 --mount 12.5 -o thermal.csv""",
+        *LENS, CONDITIONS, plot("focus shift, spot and MTF"), TABLE, "fields",
+        Option("temperatures", finite, ("LOW", "HIGH"), "lowest and highest temperature, °C (default -20 60)",
+            flag="--range", nargs=2),
+        row("samples", "temperatures", default=9),
+        Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
     ),
     _command(
         "distortion-grid",

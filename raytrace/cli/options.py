@@ -107,9 +107,11 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("ray_aiming", help="aim rays at the stop: not at all, over a stop as wide as the paraxial or the real "
            "marginal ray makes it, or auto: real where the axis bends in front of the stop, else off (default: as the "
            "file specifies, else auto)", choices=("auto", "off", "paraxial", "real")),
-    Option("temperature", finite, "C", "of the glasses and the air, °C; with one of the two the other is the file's, "
-           "or 20 °C, 1 atm"),
+    Option("temperature", finite, "C", "of the lens and the air, °C: indices change, glasses and spacers expand; with "
+           "one of the two the other is the file's, or 20 °C, 1 atm"),
     Option("pressure", not_negative, "ATM", "of the air, atm; 0 in vacuum"),
+    Option("mount", None, "MATERIAL", "of all spaces without a stated expansion: aluminium, titanium, invar, "
+           "stainless-304 …, or its expansion in 1e-6/K (default: spacers keep their length)"),
     # field and pupil
     Option("fields", field_point, "F", "field points, Y or X,Y, in the file's own kind of field (degrees or mm), "
            "never an index; vignetting factors are interpolated between the file's own fields", flag="--field",
@@ -179,7 +181,7 @@ def object_distance(several: str) -> Option:
 
 def conditions(several: str = "several: one result after the other") -> Adder:
     """Conditions other than those of the file."""
-    surroundings = ("wavelengths", "ray_aiming", "temperature", "pressure")
+    surroundings = ("wavelengths", "ray_aiming", "temperature", "pressure", "mount")
     distances = (object_distance(several), "sensor_distance")
     return group("conditions other than the file's", *distances, APERTURE, *surroundings)
 
@@ -240,15 +242,20 @@ MERIT: tuple[Adder, ...] = (
     ),
 )  # fmt: skip
 
-#: --vary, --bounds and --hold: `optimization.variables.freedom` and `bounds_of`, `optimization.problem.conditions_of`.
+#: --vary, --bounds and --hold: `optimization.variables.design_variables` and `bounds_of`, `optimization.conditions`.
 FREEDOM = group(
-    "variables and constraints, instead of the file's",
+    "variables, instead of the file's, and conditions",
     "vary",
     Option("bounds", None, "NAME:LOW..HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1..0), "
            "open on one side (sensor:30..)", nargs="+"),
-    Option("hold", None, "NAME=VALUE", "constraints: efl=50 f_number=4 'total_track<=80' 'distortion<=2%' 'bfd>=30' "
-           "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' efl@2=100, or an operand as "
-           "REAY(8,0,0,1,0,0)=2", nargs="+"),
+    exclusive(
+        Option("hold", help="without the conditions of the lens (default: with them)", flag="--no-hold",
+               action="store_false"),
+        Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens (default): efl=50 f_number=4 "
+               "'total_track<=80' 'distortion<=2%' 'bfd>=30' "
+               "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' 'edge>=1' efl@2=100, or an operand as "
+               "REAY(8,0,0,1,0,0)=2; off:efl=50 switches one off", nargs="+"),
+    ),
     about="Variables, in quotes: 'curvature thickness' (all powered surfaces, all gaps), curvature:1-4,7 conic:3 a4:3 "
     "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); pickups and solves: "
     "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "

@@ -14,8 +14,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sized
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sized
+from typing import Any, TypeAlias
 
 from tqdm import tqdm
 
@@ -23,6 +23,9 @@ EVERY = 10.0  # s between two lines
 _THOUSANDS = ("ray",)  # units that are counted by the million
 
 _open: list["Bar | Lines"] = []  # running computations, the innermost last
+
+#: Receives the progress of the innermost running computation.
+Report: TypeAlias = Callable[["Lines"], object]
 
 
 def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0) -> "Bar | Lines":
@@ -39,15 +42,18 @@ def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "",
 
 
 @contextlib.contextmanager
-def heartbeat(what: str) -> Iterator[None]:
-    """Within the block, a line every ten seconds about the running computation; none while a terminal shows a bar."""
+def heartbeat(what: str, report: Report | None = None) -> Iterator[None]:
+    """Within the block, a line every ten seconds about the running computation; none while a terminal shows a bar.
+
+    report: called instead of the line, every second.
+    """
     done, before = threading.Event(), [*_open]
 
     def beat() -> None:
-        while not done.wait(EVERY):
+        while not done.wait(EVERY if report is None else 1.0):
             shown = _open[-1:]
             if shown and isinstance(shown[0], Lines) and os.environ.get("RANK", "0") == "0":  # of processes, one speaks
-                print(f"raytrace: {shown[0]}", file=sys.stderr, flush=True)
+                (report or _print_line)(shown[0])
 
     Lines(None, what=what)
     threading.Thread(target=beat, daemon=True).start()
@@ -56,6 +62,10 @@ def heartbeat(what: str) -> Iterator[None]:
     finally:
         done.set()
         _open[:] = before  # also those that a failure left open
+
+
+def _print_line(lines: "Lines") -> None:
+    print(f"raytrace: {lines}", file=sys.stderr, flush=True)
 
 
 def silence() -> None:
@@ -113,12 +123,19 @@ class Lines:
                 yield item
                 self.update()
 
+    @property
+    def left(self) -> float | None:
+        """Estimate of the remaining time in s; None where the number of steps, or the time of one, is unknown."""
+        gone = self.n - self.initial
+        if not self.total or gone <= 0 or self.n > self.total:
+            return None
+        return (time.monotonic() - self.start_time) * (self.total - self.n) / gone
+
     def __str__(self) -> str:
-        passed, gone = time.monotonic() - self.start_time, self.n - self.initial
         said = [f"{self.n:,}{f'/{self.total:,}' if self.total else ''} {self.unit}s"] if self.n else []
-        said.append(f"{clock(passed)} elapsed")
-        if self.total and gone > 0 and self.n <= self.total:
-            said.append(f"about {clock(passed * (self.total - self.n) / gone)} left")
+        said.append(f"{clock(time.monotonic() - self.start_time)} elapsed")
+        if (left := self.left) is not None:
+            said.append(f"about {clock(left)} left")
         return ": ".join(filter(None, [self.what, ", ".join(filter(None, [*said, self.words]))]))
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import importlib
 import inspect
 import json
 import math
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TypeAlias, TypeVar
 
 import raytrace
+from raytrace.cli.commands import function
 from raytrace.cli.progress import progress
 from raytrace.cli.types import InputFile, OutputFile, OutputFolder
 from raytrace.files import check_output, check_output_folder, shipped
@@ -28,7 +28,8 @@ from raytrace.words import RaytraceError, did_you_mean, option
 
 #: Options that set the lens, by the keywords of `Lens.at`.
 CONDITIONS = (
-    *("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming", "temperature", "pressure"),
+    *("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming"),
+    *("temperature", "pressure", "mount"),
 )
 #: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.
 RUNNER_OPTIONS = (
@@ -72,8 +73,7 @@ def _run_of(arguments: argparse.Namespace) -> Run:
     """The function that a command runs: the one its row names, else its public function with a lens."""
     command = arguments.run
     if command.run:
-        module, _, name = command.run.partition(":")
-        return getattr(importlib.import_module(f"raytrace.{module}"), name)
+        return function(command.run)
     return partial(result_of_lens, verb=raytrace.public_name(command.verb))
 
 
@@ -129,6 +129,8 @@ def options_of(arguments: argparse.Namespace) -> dict:
         and not name.startswith(_FIGURE)
         and (name not in RUNNER_OPTIONS or _takes(arguments, name))
     }
+    if options.get("hold") is False:
+        options["hold"] = None
     if _takes(arguments, "progress"):
         options["progress"] = partial(progress, what=arguments.command)
     if _takes(arguments, "share"):
@@ -232,8 +234,8 @@ def check_outputs(arguments: argparse.Namespace) -> None:
 
     The folder exists and can be written in, the suffix is known, and no two options name one file.
     """
-    seen = {_real(path): name for name, path in _paths(arguments, InputFile)}
-    for name, path in _paths(arguments, OutputFile):
+    seen = {_real(path): name for name, path in paths(arguments, InputFile)}
+    for name, path in paths(arguments, OutputFile):
         other = seen.get(_real(path))
         flag = _flag(arguments, name)
         if other is not None and (name, other) not in _REPLACES:
@@ -243,14 +245,14 @@ def check_outputs(arguments: argparse.Namespace) -> None:
             check_output(path, path.suffixes)
         except ValueError as error:
             raise CommandError(f"{flag} {error}") from error
-    for name, folder in _paths(arguments, OutputFolder):
+    for name, folder in paths(arguments, OutputFolder):
         if folder.may_be_file and _real(folder) in seen:
             other = _flag(arguments, seen[_real(folder)])
             raise CommandError(f"{_flag(arguments, name)} {folder}: is the file of {other} too; give another name")
         check_output_folder(Path(folder).parent if folder.may_be_file else folder)
 
 
-def _paths(arguments: argparse.Namespace, kind: type[Name]) -> Iterator[tuple[str, Name]]:
+def paths(arguments: argparse.Namespace, kind: type[Name]) -> Iterator[tuple[str, Name]]:
     """Names and values of the arguments that are paths of a kind, single or in lists."""
     for name, value in vars(arguments).items():
         for entry in value if isinstance(value, list | tuple) else [value]:

@@ -19,6 +19,7 @@ from raytrace.cli.runner import (
     say,
 )
 from raytrace.io import read_lens, write_lens
+from raytrace.io.listing import list_lenses
 from raytrace.maths.result import Result
 from raytrace.shards import share
 from raytrace.system.lens import with_sensor_distance
@@ -27,6 +28,11 @@ from raytrace.system.lens import with_sensor_distance
 def glass(arguments: argparse.Namespace) -> Result:
     """The data of a glass."""
     return raytrace.glass(**options_of(arguments), catalogs=catalogs(arguments))
+
+
+def lenses(arguments: argparse.Namespace) -> Result:
+    """The shipped lenses and the files of a folder."""
+    return list_lenses(arguments.folder)
 
 
 def check(arguments: argparse.Namespace) -> Result:
@@ -38,6 +44,24 @@ def convert(arguments: argparse.Namespace) -> Result:
     """Write the file in another format."""
     options = options_of(arguments) | {"source": find_lens(arguments.source)}
     return raytrace.convert(**options, catalogs=catalogs(arguments))
+
+
+def edit(arguments: argparse.Namespace) -> Result:
+    """The edits of a lens in their order; the lens is written."""
+    from raytrace.edit.steps import edited  # loads the package of edits
+
+    steps = getattr(arguments, "steps", [])
+    if not steps:
+        raise CommandError("no edit is given, such as --scale 2, --reverse, --delete 3-4")
+    try:
+        result = edited(open_lens(arguments), steps)
+    except ValueError as error:
+        raise CommandError(f"{arguments.lens}: {error}") from error
+    with printed_on_failure(result, arguments):
+        write_lens(result.lens, arguments.output, catalogs=catalogs(arguments))
+    say(f"written: {arguments.output}")
+    arguments.output = None
+    return result
 
 
 def layout(arguments: argparse.Namespace) -> Result:

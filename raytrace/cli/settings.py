@@ -100,7 +100,7 @@ def listed(kind: type, rows: Mapping[str, Mapping]) -> str:
     return "\n".join(["settings, of --settings and --set:", *lines])
 
 
-def given_settings(arguments: argparse.Namespace, kind: type) -> dict:
+def given_settings(arguments: argparse.Namespace, kind: type[Settings]) -> dict:
     """The settings of --settings and --set, by their names. Raises BadSettings."""
     given = {} if arguments.settings is None else _of_file(arguments.settings, kind)
     for words in arguments.set:
@@ -115,18 +115,19 @@ def given_settings(arguments: argparse.Namespace, kind: type) -> dict:
     return given
 
 
-def _of_file(path: str, kind: type) -> dict:
+def _of_file(path: str, kind: type[Settings]) -> dict:
     """Settings of a TOML file, whose tables only group them, or of a run's settings.json."""
+    is_of_run = Path(path).suffix.lower() == ".json"
     try:
         text = Path(path).read_text(encoding="utf-8")
-        document = json.loads(text) if Path(path).suffix.lower() == ".json" else tomllib.loads(text)
+        document = json.loads(text) if is_of_run else tomllib.loads(text)
     except OSError as error:
         raise BadSettings(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
         raise BadSettings(f"{path}: no TOML, and no JSON of a run ({error})") from error
     if not isinstance(document, dict):
         raise BadSettings(f"{path}: expected settings by their names")
-    entries: dict[str, object] = {}
+    entries: dict[str, object] = {**kind.UNRECORDED} if is_of_run else {}
     for name, entry in document.items():
         if name not in _OF_RUNS:
             entries |= entry if isinstance(entry, dict) else {name: entry}

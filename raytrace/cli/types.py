@@ -234,7 +234,7 @@ def _number(text: str) -> float:
     try:
         number = float(text)
     except ValueError:
-        hint = "; a share is written as 0.9" if text.endswith("%") else " (LENS goes before the options)"
+        hint = "; a share is written as 0.9" if text.endswith("%") else ""
         raise argparse.ArgumentTypeError(f"{text!r} is not a number{hint}") from None
     if number != number:
         raise argparse.ArgumentTypeError("nan is not a number to work with")

@@ -68,7 +68,15 @@ from raytrace.imaging.field_kernels import (
     order_of,
     warn_of_dark_places,
 )
-from raytrace.imaging.image import BOUNDARIES, as_picture, blur, linearised, transfer_functions
+from raytrace.imaging.image import (
+    BOUNDARIES,
+    as_picture,
+    blur,
+    linearised,
+    pixel_means,
+    pixel_transfer,
+    transfer_functions,
+)
 from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.render import Rendering, element_in_stop, illumination_at, render
 from raytrace.imaging.restoration import restore
@@ -130,7 +138,9 @@ class Camera(nn.Module, Generic[V]):
     object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
     whose image positions follow the chief ray while the lens changes. Default: 0, 0.7 and 1 of the half diagonal of the
     sensor, fixed on the sensor; on axis without a sensor.
-    pixels: of the sensor across the PSF window, an odd number, 21 by default.
+    oversampling: pixels of pictures and PSFs across a pixel of the sensor, which records their mean: for
+    super-resolution, whose network maps (B, C, h, w) to the pixels of the picture, s h × s w.
+    pixels: across the PSF window, those of pictures, an odd number, 21 by default.
     center: of the PSF window, "chief" (the chief ray) or "centroid" (of the light, as `psf`), which the window follows,
     so that displacement of the image is not counted as blur. normalise: "window" (PSFs of sum 1; `energy_outside` is
     the share of the light that they leave out) or "energy" (the sum is the share of the light through the entrance
@@ -172,6 +182,7 @@ class Camera(nn.Module, Generic[V]):
         model: str | Model | None = None,
         object_distances: tuple[float, float] = (1e4, 5e4),
         fields: Tensor | Sequence | None = None,
+        oversampling: int = 1,
         pixels: int = 21,
         center: Literal["chief", "centroid"] = "chief",
         normalise: Normalisation = "window",
@@ -196,7 +207,7 @@ class Camera(nn.Module, Generic[V]):
         self._steps: LensSteps | None = None
         self.range, self.sensor, self.illumination = object_distances, sensor or Sensor(), illumination
         self.sensor_distance, self.wavelengths, self.exact = sensor_distance, wavelengths, exact
-        self.boundary, self.filter = boundary, filter
+        self.boundary, self.filter, self.oversampling = boundary, filter, oversampling
         self._check_element()
         with torch.no_grad():
             lens = self.lens()
@@ -233,6 +244,14 @@ class Camera(nn.Module, Generic[V]):
             option = "exact" if self.exact else "filter"
             raise ValueError(f"{option} applies only to a phase element without a lens: leave {option} out")
 
+    @property
+    def picture_sensor(self) -> Sensor:
+        """The sensor with pixels as small as those of pictures, over which PSFs are integrated."""
+        if self.oversampling == 1:
+            return self.sensor
+        columns, rows = self.sensor.pixels
+        return dataclasses.replace(self.sensor, pixels=(self.oversampling * columns, self.oversampling * rows))
+
     def lens(self) -> Lens:
         """The current lens; of an element without one, the stop that it is in."""
         if isinstance(self.variables, Variables):
@@ -265,6 +284,10 @@ class Camera(nn.Module, Generic[V]):
                 f"normalise {self.normalise!r} is not supported with a phase element at the stop, whose PSFs have sum "
                 "1: leave normalise out"
             )
+        if isinstance(self.oversampling, bool) or not isinstance(self.oversampling, int) or self.oversampling < 1:
+            raise ValueError(f"oversampling {self.oversampling!r}: expected an integer ≥ 1")
+        if self.oversampling > 1 and self.filter is not None:
+            raise ValueError("filter with oversampling: its formula has no aliases; leave filter out")
         if self.normalise == "haze" and (self.illumination or not isinstance(self.variables, PhaseVariables)):
             raise ValueError("normalise 'haze': expected an element without a lens, and no illumination")
         if self.tolerances is None:
@@ -336,7 +359,7 @@ class Camera(nn.Module, Generic[V]):
             "element": None if self.element is None else self.element.identity(),
             "sensor_distance": self.sensor_distance,
             "sensor": plain(dataclasses.asdict(self.sensor)),
-            "window": [self.size, self.size, self.sensor.pitch],
+            "window": [self.size, self.size, self.picture_sensor.pitch],
             "model": self.model,
             "object_distances": list(self.range),
             "network": type(self.network).__name__,
@@ -383,7 +406,7 @@ class Camera(nn.Module, Generic[V]):
 
     @property
     def margin(self) -> int:
-        """Rows and columns by which the PSF window shrinks an image."""
+        """Rows and columns, in pixels of the picture, by which the PSF window shrinks an image."""
         return self.size - 1 if self.boundary == "valid" else 0
 
     def use(self, model: str | Model) -> None:
@@ -406,17 +429,20 @@ class Camera(nn.Module, Generic[V]):
         return lens_as_built(lens, self.tolerances, errors, self.fields)
 
     @torch.no_grad()
-    def plan(self, object_distances: Tensor | Sequence[float] | None = None) -> int:
+    def plan(self, object_distances: Tensor | Sequence[float] | None = None, **sampling: Any) -> int:
         """The order of the PSF model that meets the tolerance at object distances (Z,) mm.
 
         By default at the ends and the middle of the range. With elements alone their sampling is fixed; the order is 0.
+        sampling: of elements alone, engine, samples, nodes and tol as for `wave_optics.plan.plan`.
         """
         near, far = self.range
         default_distances = (near, 2 / (1 / near + 1 / far), far)
         distances = self._distances(default_distances if object_distances is None else object_distances)
         if isinstance(self.variables, PhaseVariables):
-            self._sampling = sampling_plan(self.element_kernels(distances).scene)
+            self._sampling = sampling_plan(self.element_kernels(distances).scene, **sampling)
             return 0
+        if sampling:
+            raise TypeError(f"{next(iter(sampling))} applies only to a phase element without a lens: leave it out")
         lens = self.lens()
         if self.tolerances is not None:
             lens = self.as_built(draw_errors(self.tolerances, len(distances)))
@@ -424,7 +450,7 @@ class Camera(nn.Module, Generic[V]):
             warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             warnings.simplefilter("ignore", UnfilledStop)  # it was warned of at construction
             self._order = order_of(
-                lens, self.sensor, self.model, self.fields, distances, self.size, self.tol,
+                lens, self.picture_sensor, self.model, self.fields, distances, self.size, self.tol,
                 elements=self.elements(), center=self.center, parameters=self.psf_parameters,
             )  # fmt: skip
         return self._order
@@ -436,8 +462,8 @@ class Camera(nn.Module, Generic[V]):
         distances, elements = self._distances(object_distances), self.elements(draw=draw)
         lens = element_in_stop(elements, self.sensor, self.sensor_distance, self.wavelengths)
         weights = self.sensor.weights(lens.wavelengths, lens.wavelength_weights).to(distances)
-        arguments = self.sensor, self.size, distances, weights, self.exact, self.normalise, self._sampling, self._memo
-        return ElementKernels(lens, elements, *arguments)
+        sensor, how = self.picture_sensor, (self.exact, self.normalise, self._sampling, self._memo)
+        return ElementKernels(lens, elements, sensor, self.size, distances, weights, *how)
 
     @uncompiled
     def kernels(
@@ -530,7 +556,7 @@ class Camera(nn.Module, Generic[V]):
         else:
             kernel_source = FieldKernels(
                 lens,
-                self.sensor,
+                self.picture_sensor,
                 self.model,
                 self.plan() if self._order is None else self._order,
                 self.size,
@@ -631,6 +657,7 @@ class Camera(nn.Module, Generic[V]):
         points: Tensor | None = None,
     ) -> Tensor:
         """The noise-free sensor image, (B, C, H - margin, W - margin); the margin is 0 unless the boundary is "valid".
+        With oversampling s its pixels are means of s × s: (B, C, (H - margin)/s, (W - margin)/s).
 
         picture: (B, C, H, W) in [0, 1], centred at the places that field, points and errors give, as for `kernels`;
         integers of 8 or 16 bits are levels of sRGB (`linearised`). Half-precision pictures are blurred in float32; the
@@ -641,17 +668,24 @@ class Camera(nn.Module, Generic[V]):
         return self.blurred(picture, self.kernels(distances, field, errors, points=points))
 
     def blurred(self, light: Tensor, kernels: Tensor) -> Tensor:
-        """Light (B, C, H, W) convolved with kernels (B, C, h, w), with the boundary extension and haze background."""
+        """Light (B, C, H, W) convolved with kernels (B, C, h, w), with the boundary extension and haze background, in
+        pixels of the sensor."""
         light = light.to(torch.promote_types(light.dtype, torch.float32))
         kernels = kernels.to(light.dtype)
         image = blur(light, kernels, boundary=self.boundary)
-        if self.normalise != "haze":
-            return image
-        return image + (1 - kernels.sum((-2, -1), keepdim=True)) * light.mean((-2, -1), keepdim=True)
+        if self.normalise == "haze":
+            image = image + (1 - kernels.sum((-2, -1), keepdim=True)) * light.mean((-2, -1), keepdim=True)
+        return pixel_means(image, self.oversampling)
 
     def transfer(self, kernels: Tensor, size: int | Sequence[int]) -> Tensor:
-        """H (..., rows, columns) of kernels (..., h, w) of the camera on periodic images of this size, with haze."""
-        return transfer_functions(kernels, size, haze=self.normalise == "haze")
+        """H (..., rows, columns) of kernels (..., h, w) of the camera on periodic images of this size, with haze.
+
+        With oversampling s, size is that of pictures, and H includes the mean over s × s pixels (`pixel_transfer`).
+        """
+        transfer = transfer_functions(kernels, size, haze=self.normalise == "haze")
+        if self.oversampling == 1:
+            return transfer
+        return transfer * pixel_transfer(transfer.shape[-2:], self.oversampling).to(transfer)
 
     @uncompiled
     def _of_channels(self, picture: Tensor, distances: Tensor) -> Tensor:

@@ -67,6 +67,7 @@ def camera_error(
     columns) the filter of each field is joint, `joint_wiener`. draw: of an element alone, generator of errors of
     fabrication. Round elements whose sampling is fixed (`Camera.plan`) need an eighth of the frequencies (`octant`).
     """
+    _refuse_aliases(camera)
     spectrum = spectrum.to(camera.fields.device)
     sigma = camera.sensor.noise_deviation(spectrum)
     haze = camera.normalise == "haze"
@@ -93,6 +94,7 @@ def field_filters(
     places: (N,) shares of the way from the middle of the sensor to its corner; distances: (Z,) mm, by default evenly
     over the camera's range; spectrum: (C, rows, columns) of the scene.
     """
+    _refuse_aliases(camera)
     distances = even_distances(camera) if distances is None else distances
     spectrum = spectrum.to(camera.fields.device)
     kernels = camera.kernels_over_field(distances, camera.sensor.on_diagonal(places))
@@ -100,6 +102,11 @@ def field_filters(
     if spectrum.dim() == 4:
         return joint_wiener(transfer, spectrum, camera.sensor.noise_deviation(spectrum))
     return depth_invariant_wiener(transfer, spectrum.to(kernels.dtype), camera.sensor.noise_deviation(spectrum))
+
+
+def _refuse_aliases(camera: Camera) -> None:
+    if camera.oversampling > 1:
+        raise ValueError(f"a camera with oversampling {camera.oversampling}: the error here has no aliases; expected 1")
 
 
 def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:
@@ -187,55 +194,48 @@ def optimise_closed_form(
     return Course(errors, penalties, names, no_optimum)
 
 
-def closed_form_from_spots(camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None) -> Course:
-    """Minimise `camera_error` by steps of second order from the lens of the sharpest spots, and from the lens as it is.
-
-    Returns the better one, at which the lens of the camera is.
-    """
-    variables, ends = camera.variables, []
-    start = copy.deepcopy(variables.state_dict())
-    for spots_first in (True, False):
-        variables.load_state_dict(start)
-        if spots_first:
-            LensSteps(variables).minimise_spots()
-        course = optimise_closed_form(camera, spectrum, distances=distances, optimizer="lm")
-        ends.append((course, copy.deepcopy(variables.state_dict())))
-    best, state = min(ends, key=lambda end: end[0].errors[-1] + end[0].penalties[-1])
-    variables.load_state_dict(state)
-    return best
-
-
 def least_of_closed_form(
-    camera: Camera[Variables], spectrum: Tensor, *, distances: Tensor | None = None
+    camera: Camera[Variables],
+    spectrum: Tensor,
+    *,
+    distances: Tensor | None = None,
+    optimizer: Literal["lbfgs", "lm"] = "lbfgs",
 ) -> tuple[Course, float]:
-    """Minimise `camera_error` by two descents; returns the better one and the sensor distance reached by the first.
+    """Minimise `camera_error` by descents from several lenses; returns the best one, at which the lens of the camera
+    is, and the sensor distance reached by the first.
 
-    The first starts at the camera's lens. The second starts at the minimum of a scan of sensor distances, evenly over
-    those at which an object of the range is in focus, if the sensor varies and the scan promises less than the first
-    one reached: DRT and Gaussian DRT have several optima.
+    The first starts at the camera's lens. With "lm" the next starts at the sharpest spots. The last starts at the
+    minimum of a scan of sensor distances, evenly over those at which an object of the range is in focus, if the sensor
+    varies and the scan promises less than the others reached: DRT and Gaussian DRT have several optima.
     """
     distances = even_distances(camera) if distances is None else distances
-    variables = camera.variables
+    variables, ends = camera.variables, []
     start = copy.deepcopy(variables.state_dict())
-    first = optimise_closed_form(camera, spectrum, distances=distances)
+
+    def descend() -> None:
+        course = optimise_closed_form(camera, spectrum, distances=distances, optimizer=optimizer)
+        ends.append((course, copy.deepcopy(variables.state_dict())))
+        variables.load_state_dict(start)
+
+    descend()
+    if optimizer == "lm":
+        LensSteps(variables).minimise_spots()
+        descend()
+    if "sensor" in [variable.name for variable in variables.variables] and camera.model in _SCANNED:
+        with torch.no_grad():
+            ranges = _in_focus(camera), variables.bounds.get("sensor", (-math.inf, math.inf))
+        low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
+        count = _SCANNED[camera.model]
+        sensors = [low + (high - low) * (number + 0.5) / count for number in range(count)]
+        errors = scan(camera, spectrum, sensors, distances) if high > low else [math.inf]
+        if min(errors) < min(course.errors[-1] for course, _ in ends) * (1 - _BETTER):
+            _move_sensor(camera, sensors[errors.index(min(errors))])
+            descend()
+    variables.load_state_dict(ends[0][1])
     reached = float(variables().surfaces[-2].thickness.detach())
-    end = copy.deepcopy(variables.state_dict())
-    if "sensor" not in [variable.name for variable in variables.variables] or camera.model not in _SCANNED:
-        return first, reached
-    variables.load_state_dict(start)
-    with torch.no_grad():
-        ranges = _in_focus(camera), variables.bounds.get("sensor", (-math.inf, math.inf))
-    low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
-    count = _SCANNED[camera.model]
-    sensors = [low + (high - low) * (number + 0.5) / count for number in range(count)]
-    errors = scan(camera, spectrum, sensors, distances) if high > low else [math.inf]
-    if min(errors) < first.errors[-1] * (1 - _BETTER):
-        _move_sensor(camera, sensors[errors.index(min(errors))])
-        second = optimise_closed_form(camera, spectrum, distances=distances)
-        if first.no_optimum or not second.no_optimum:
-            return second, reached
-    variables.load_state_dict(end)
-    return first, reached
+    best, state = min(ends, key=lambda end: (bool(end[0].no_optimum), end[0].errors[-1] + end[0].penalties[-1]))
+    variables.load_state_dict(state)
+    return best, reached
 
 
 @torch.no_grad()
@@ -270,7 +270,7 @@ def out_of_focus(camera: Camera[Variables]) -> str:
 
 def _in_focus(camera: Camera[Variables]) -> tuple[float, float]:
     """Sensor distances in mm at which an object of the range is in focus to the width of the PSF."""
-    width = camera.sensor.pitch * camera.size
+    width = camera.picture_sensor.pitch * camera.size
     return sensor_range(camera.variables(), camera.range, fields=camera.fields, width=width)
 
 

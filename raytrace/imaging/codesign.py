@@ -12,21 +12,21 @@ import dataclasses
 import functools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.func import functional_call
 
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import (
     Course,
     camera_error,
-    closed_form_from_spots,
     even_distances,
     field_filters,
     focus_columns,
@@ -40,7 +40,7 @@ from raytrace.imaging.network import RedNetShape, UNetShape, network
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.restoration import psnr, restore, restore_jointly
 from raytrace.imaging.sensor import Sensor
-from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
+from raytrace.imaging.training import DamagedRun, Record, Run, Share, load_state, train
 from raytrace.imaging.variables import Variables
 from raytrace.io import write_lens
 from raytrace.maths.result import plain
@@ -48,6 +48,7 @@ from raytrace.maths.sampling import hexapolar, sobol
 from raytrace.optimization.least_squares import NoOptimum
 from raytrace.psf_models import DRT, Paraxial, model_of
 from raytrace.settings import GAUSSIAN, CodesignSettings
+from raytrace.shards import share
 from raytrace.stores import fields_of, read_document
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
@@ -61,6 +62,10 @@ _SAMPLE = 10  # last number of the key of a sample's random numbers
 TEST_EPOCH = 2**20  # epoch of the test samples, which training never reaches
 _FIRST_TEST_TRIAL = 2**62  # trial number of the first perturbed test camera, of seed 0, which training never reaches
 STEPS = ("joint", "refine")
+LENS_STEPS = 6  # of the lens in a turn
+_BATCHES = 4  # of the loss of a turn
+_ADAPTING = 3  # steps of the network inside the loss of a turn
+_RATES = tuple(4.0**-k for k in range(8))  # of these steps
 TEST_POSITIONS = (0.0, 0.7, 1.0)  # of the test patches, as shares of the half diagonal of a sensor
 LENS = "lens.zmx"  # of a run: the optimised lens
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
@@ -183,6 +188,8 @@ def initial_camera(lens: Lens, settings: CodesignSettings) -> Camera[Variables]:
     """The camera of an experiment at its start."""
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
+    if settings.turns and settings.optimizer != "lm":
+        raise ValueError(f"turns {settings.turns} with optimizer {settings.optimizer!r}: expected optimizer lm")
     return Camera(
         variables(lens, settings),
         network_at_start(settings),
@@ -359,10 +366,20 @@ def _summed(camera: Camera, batch: Batch, *measures: Callable[[Tensor], Tensor])
 
 
 def optimise(
-    camera: Camera[Variables], pictures: Pictures, settings: CodesignSettings, run: Run, *, every: int = 50
+    camera: Camera[Variables],
+    pictures: Pictures,
+    settings: CodesignSettings,
+    run: Run,
+    *,
+    every: int = 50,
+    turn: int = 0,
 ) -> Iterator[tuple[int, Record]]:
-    """The steps of one training, one at a time; lens variables with requires_grad=False stay fixed."""
+    """The steps of one training, one at a time; lens variables with requires_grad=False stay fixed.
+
+    turn: after which the network is trained again, a column of the log.
+    """
     batches = Batches(pictures, settings, camera.tolerances if settings.as_built else None)
+    about = {"turn": float(turn)} if turn else {}
     pixels = settings.batch * settings.patch**2
     optics = [p for p in camera.variables.parameters() if p.requires_grad]
     groups: list[dict[str, Any]] = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
@@ -370,7 +387,7 @@ def optimise(
     optimizer, steps = torch.optim.Adam(groups), settings.epochs * batches.steps_per_epoch
 
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
+        return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers() | about
 
     return train(
         camera,
@@ -383,6 +400,70 @@ def optimise(
         penalty=camera.variables.violation,
         schedule="cosine" if settings.decay == "cosine" else None,
     )
+
+
+def adapted_error(
+    camera: Camera[Variables], batches: Sequence[Batch], rate: float, *, steps: int = _ADAPTING
+) -> Tensor:
+    """Mean |restored - picture| of batches behind a network that has adapted to the lens, plus the penalty for violated
+    limits; differentiable in the lens through the adaptation.
+
+    The weights take `steps` steps of this rate down the gradient of the same mean from those of the camera, which stay.
+    """
+    recorded, targets = [], []
+    for batch in batches:
+        batch = batch.to(camera.fields.device)
+        image = camera.image(batch.picture, batch.distance, batch.field, batch.errors, points=batch.points)
+        recorded.append(camera.demosaiced(image, batch.points, batch.index, batch.seed))
+        targets.append(camera.target(batch.picture))
+    weights = {name: weight.detach().requires_grad_() for name, weight in camera.network.named_parameters()}
+    images, pictures = torch.cat(recorded).to(next(iter(weights.values())).dtype), torch.cat(targets)
+
+    def error(weights: Mapping[str, Tensor]) -> Tensor:
+        return (functional_call(camera.network, dict(weights), (images,)) - pictures).abs().mean()
+
+    for _ in range(steps):
+        slopes = torch.autograd.grad(error(weights), list(weights.values()), create_graph=True)
+        steepest = zip(weights.items(), slopes, strict=True)
+        weights = {name: weight - rate * slope for (name, weight), slope in steepest}
+    return error(weights) + camera.variables.violation()
+
+
+def adapting_rate(camera: Camera[Variables], batches: Sequence[Batch]) -> float:
+    """The rate, a power of 1/4, by which the error behind the adapted network is lowest, of the lens as it is."""
+    errors = {rate: float(adapted_error(camera, batches, rate).detach()) for rate in (0.0, *_RATES)}
+    return min(errors, key=lambda rate: errors[rate] if math.isfinite(errors[rate]) else math.inf)
+
+
+def take_turn(
+    camera: Camera[Variables], pictures: Pictures, settings: CodesignSettings, run: Run, turn: int
+) -> Iterator[tuple[int, Record]]:
+    """The steps of the lens of a turn, one at a time, for the loss of a network that adapts to the lens.
+
+    The batches of all steps of a turn are the same, and in no training. A turn that resumes needs the camera as it was
+    at its start.
+    """
+    built, size = camera.tolerances if settings.as_built else None, settings.batch
+    count = min(_BATCHES, steps_per_epoch(pictures, settings))
+    firsts, epoch = range(0, count * size, size), settings.epochs + turn
+    batches = [make_batch(pictures, settings, [*range(first, first + size)], epoch, built) for first in firsts]
+    rate = adapting_rate(camera, batches)
+    state = run.load()
+    step = 0 if state is None else load_state(camera, state, run.checkpoint)
+    is_writer, variables = share().rank == 0, camera.variables
+    if is_writer:
+        run.drop_rows_from(step)
+    variables.requires_grad_(True)
+    while step < LENS_STEPS:
+        penalty, numbers = float(variables.violation().detach()), variables.numbers()
+        total = camera.lens_step(lambda: adapted_error(camera, batches, rate))
+        step += 1
+        record = {"loss": total - penalty, "penalty": penalty, **numbers, "turn": float(turn), "lens_step": float(step)}
+        if is_writer:
+            run.append([(step - 1, record)])
+            run.save({"step": step, "module": camera.state_dict()})
+        yield step - 1, record
+    variables.requires_grad_(False)
 
 
 @torch.no_grad()
@@ -515,28 +596,42 @@ def run_model(
 
     def run(step: str) -> Run:  # raises OtherSettings
         document = {**dataclasses.asdict(settings), **about, "part": step}
-        return Run(folder / step, document, usual=default_settings(settings))
+        return Run(folder / step, document, usual=settings.recorded({}))
 
-    joint = run(STEPS[0])
+    def begin(camera: Camera[Variables], settings: CodesignSettings, run: Run) -> None:
+        """The lens at the start of a training: at the optimum of the closed form, and fixed there, for lm."""
+        is_second_order = settings.optimizer == "lm"
+        if (is_second_order or settings.start in ("spectral", GAUSSIAN)) and not run.checkpoint.exists():
+            course = to_closed_form(camera, settings, spectrum_of(train_pictures, settings))
+            if course.no_optimum:
+                warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
+        camera.variables.requires_grad_(not is_second_order)
+
+    current = run(STEPS[0])
     if (folder / "outcome.json").exists():
         return
     trained = initial_camera(lens, settings).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
-    is_second_order = settings.optimizer == "lm"
-    if (is_second_order or settings.start in ("spectral", GAUSSIAN)) and not joint.checkpoint.exists():
-        course = to_closed_form(trained, settings, spectrum_of(train_pictures, settings))
-        if course.no_optimum:
-            warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
-    if is_second_order:  # the lens is fixed, only the network is trained
-        trained.variables.requires_grad_(False)
-    for step, record in optimise(trained, train_pictures, settings, joint):
+    begin(trained, settings, current)
+    for step, record in optimise(trained, train_pictures, settings, current):
         yield STEPS[0], step, record
+    steps_done, again = settings.epochs * steps_per_epoch(train_pictures, settings), settings
     if settings.relearn:
         trained, again = with_catalog_glasses(trained, settings)
         trained.to(device)
-        steps_done = settings.epochs * steps_per_epoch(train_pictures, settings)
-        for step, record in optimise(trained, train_pictures, again, run("glasses")):
+        current = run("glasses")
+        begin(trained, again, current)
+        for step, record in optimise(trained, train_pictures, again, current):
             yield STEPS[0], steps_done + step, record
+        steps_done += again.epochs * steps_per_epoch(train_pictures, settings)
+    again = dataclasses.replace(again, epochs=settings.epochs)
+    for turn in range(1, settings.turns + 1):
+        for step, record in take_turn(trained, train_pictures, again, run(f"lens_{turn}"), turn):
+            yield STEPS[0], steps_done + step, record
+        steps_done += LENS_STEPS
+        for step, record in optimise(trained, train_pictures, again, run(f"network_{turn}"), turn=turn):
+            yield STEPS[0], steps_done + step, record
+        steps_done += settings.epochs * steps_per_epoch(train_pictures, settings)
     l1_joint = held_out_error(trained, test_pictures, settings, progress=progress)
     freeze_lens(trained, settings)
     l1_before = held_out_error(trained, test_pictures, settings, progress=progress)
@@ -592,11 +687,6 @@ def outcome(folder: Path) -> Outcome | None:
     return Outcome(**document | {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None})
 
 
-def default_settings(settings: CodesignSettings) -> dict:
-    """The defaults of all settings, for folders of older versions without settings."""
-    return {field.name: field.default for field in dataclasses.fields(settings)}
-
-
 # -- the closed form
 
 
@@ -635,16 +725,17 @@ class Optimum:
 OPTIMUM_COLUMNS = tuple(field.name for field in dataclasses.fields(Optimum))[:9]
 
 
+#: Optimizer of the closed form by that of the lens.
+_DESCENTS: dict[str, Literal["lbfgs", "lm"]] = {"lm": "lm", "adam": "lbfgs"}
+
+
 def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spectrum: Tensor) -> Course:
     """Move the lens of a camera to an optimum of the closed form: by steps of second order for the optimizer "lm", else
     to the optimum named by `start`: of the PSF model of the experiment, or of the Gaussian model."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
     first = initial_camera(trained.variables.lens, dataclasses.replace(settings, model=model))
     distances = even_distances(first, spread=settings.spread)
-    if settings.optimizer == "lm":
-        course = closed_form_from_spots(first, spectrum, distances=distances)
-    else:
-        course, _ = least_of_closed_form(first, spectrum, distances=distances)
+    course, _ = least_of_closed_form(first, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer])
     trained.variables.load_state_dict(first.variables.state_dict())
     return course
 
@@ -655,10 +746,9 @@ def closed_form(lens: Lens, settings: CodesignSettings, spectrum: Tensor) -> Opt
     if settings.start == GAUSSIAN:
         to_closed_form(optimised, settings, spectrum)
     distances = even_distances(optimised, spread=settings.spread)
-    if settings.optimizer == "lm":
-        course, downhill = closed_form_from_spots(optimised, spectrum, distances=distances), math.nan
-    else:
-        course, downhill = least_of_closed_form(optimised, spectrum, distances=distances)
+    course, downhill = least_of_closed_form(
+        optimised, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer]
+    )
     with torch.no_grad():
         lens = optimised.variables()
         error = camera_error(optimised, spectrum, distances)

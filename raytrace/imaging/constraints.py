@@ -18,9 +18,10 @@ import numpy as np
 
 from raytrace.materials.glass import Glass
 from raytrace.optimization.attained import EXACT, NotReached
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.glass_choice import Pool
 from raytrace.optimization.least_squares import Linear, NoStep, Sides, SumOfSquares
-from raytrace.optimization.problem import Condition, Problem
+from raytrace.optimization.problem import Problem
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row

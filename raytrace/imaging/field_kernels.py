@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.imaging.sensor import Sensor
+from raytrace.imaging.sensor import Sensor, landing_of
 from raytrace.maths.numerics import safe_divide, safe_sqrt, varies
 from raytrace.maths.sampling import Grid, gauss_rings, with_rim
 from raytrace.maths.sampling import grid as make_grid
@@ -41,7 +41,7 @@ from raytrace.psf_models import (
 )
 from raytrace.psf_models.gaussian import gaussian_pixels, wide_gaussian_pixels
 from raytrace.psf_models.models import is_sampled_in_common
-from raytrace.system.lens import Lens, is_round_about_axis, one_lens, with_field_kind, with_object_distance
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, one_lens, with_field_kind, with_object_distance
 from raytrace.tracing.f_number import axial_f_number
 from raytrace.tracing.launch import field_of_object
 from raytrace.tracing.paraxial import axial_beam
@@ -136,17 +136,28 @@ class FieldKernels:
         lenses each with its lens."""
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             fields = torch.zeros_like(fields)
-        finite = self.object_distances.detach().isfinite().to(fields)
-        which = torch.unique(torch.stack([*fields.detach(), finite]), dim=1, return_inverse=True)[1]
+        keys = [self.object_distances.detach().isfinite()]
+        # Of waves, the kernels of a field are sampled in common; stored rays have one field at all distances.
+        is_by_field = MODELS[self.model].by_field or self.memo is not None
+        keys += fields.detach() if is_by_field else []
+        which = torch.unique(torch.stack([key.to(fields) for key in keys]), dim=1, return_inverse=True)[1]
+        most = len(which) if is_by_field else _TOGETHER
+        count = 1 if is_sampled_in_common(self.lens, self.model) else most
         parts, order = [], []
         for number in which.unique():
             group = torch.nonzero(which == number)[:, 0]
-            for some in group.split(1 if is_sampled_in_common(self.lens, self.model) else len(group)):
-                lens = self.lens if self.lens.count is None else one_lens(self.lens, some)
-                kernels = dataclasses.replace(self, lens=lens, object_distances=self.object_distances[some])
-                parts.append(kernels.of_fields(fields[:, some[:1]])[0])
-                order.append(some)
+            kernels, places = self._of(group), fields[:, group[:1]] if is_by_field else fields[:, group, None]
+            origin = kernels.origin(places)  # the chief rays of all lenses are aimed and traced at once
+            for some in torch.arange(len(group), device=group.device).split(count):
+                part = places if is_by_field else places[:, some]
+                parts.append(kernels._of(some)._about(part, origin[:, some])[0])
+            order.append(group)
         return torch.cat(parts)[torch.cat(order).argsort()]
+
+    def _of(self, numbers: Tensor) -> "FieldKernels":
+        """Of some of the object distances, and of a batch of lenses some of them."""
+        lens = self.lens if self.lens.count is None else one_lens(self.lens, numbers)
+        return dataclasses.replace(self, lens=lens, object_distances=self.object_distances[numbers])
 
     def _groups(self) -> list[Tensor]:
         """Numbers of the places whose kernels one call computes: their distances are all finite or all infinite."""
@@ -226,11 +237,15 @@ class FieldKernels:
             if of_points and MODELS[self.model].in_common and not varies(part):
                 # Field points that vary break symmetry: one sampling, with derivatives or not.
                 part = part.detach().requires_grad_()
-            light, arrived = self.light(part, origin) if self.elements else self._of_model(part, origin)
-            weights = self.weights.to(light)
-            light = torch.einsum("cw,dfwij->fdcij", weights, light).flip(-1)
-            kernels.append(_normalised(light, torch.einsum("cw,dfw->fdc", weights, arrived), self.normalise))
+            kernels.append(self._about(part, origin))
         return torch.cat(kernels)
+
+    def _about(self, fields: Tensor, origin: Tensor) -> Tensor:
+        """Kernels (F, D, C, size, size) of fields (2, F), (2, D, F) about their origins, of one call of the model."""
+        light, arrived = self.light(fields, origin) if self.elements else self._of_model(fields, origin)
+        weights = self.weights.to(light)
+        light = torch.einsum("cw,dfwij->fdcij", weights, light).flip(-1)
+        return _normalised(light, torch.einsum("cw,dfw->fdc", weights, arrived), self.normalise)
 
     def _of_model(self, fields: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
         """Light (D, F, W, h, w), columns towards +x, and that on the whole sensor plane (D, F, W); 1 = all through the
@@ -332,12 +347,12 @@ class FieldKernels:
         return shift, sagittal, tangential, known.to(radii)
 
     def origin(self, fields: Tensor) -> Tensor:
-        """Points (2, D, N, 1 or W) mm where the chief rays of fields (2, N) meet the sensor: see `origin`."""
+        """Points (2, D, N, 1 or W) mm where chief rays of fields (2, N), (2, D, N) meet the sensor: see `origin`."""
         if not varies(fields) and not bool(fields.any()) and is_round_about_axis(self.lens):
-            return fields.new_zeros(2, len(self.object_distances), fields.shape[1], 1).expand(
+            return fields.new_zeros(2, len(self.object_distances), fields.shape[-1], 1).expand(
                 -1, -1, -1, 1 if self.lateral_colour else len(self.lens.wavelengths)
             )
-        return origin(self.lens, self.sensor, fields, self.object_distances, lateral_colour=self.lateral_colour)
+        return origin(self.lens, fields, self.object_distances, lateral_colour=self.lateral_colour)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -414,7 +429,7 @@ def channel_moments(
         lens, model_of("gaussian", order=4), fields=fields, object_distances=object_distances, per_wavelength=True,
         grid=make_grid(points.new_tensor(1.0), 1),
     )  # fmt: skip
-    place = spots.centroid - origin(lens, sensor, fields, object_distances, lateral_colour=lateral_colour)
+    place = spots.centroid - origin(lens, fields, object_distances, lateral_colour=lateral_colour)
     weights = sensor.weights(lens.wavelengths, lens.wavelength_weights).to(place)
     mean = (place.nan_to_num(0.0)) @ weights.T
     square = (spots.covariance[::2] + place.square()).nan_to_num(0.0) @ weights.T
@@ -467,14 +482,14 @@ def by_angle(lens: Lens) -> Lens:
     return dataclasses.replace(angled, fields=dataclasses.replace(angled.fields, x=x, y=y))
 
 
-def origin(lens: Lens, sensor: Sensor, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:
-    """Points where the chief rays of fields (2, N) meet the sensor, mm: (2, D, N, 1), without lateral colour
+def origin(lens: Lens, fields: Tensor, distances: Tensor, *, lateral_colour: bool) -> Tensor:
+    """Points where the chief rays of fields (2, N), (2, D, N) meet the sensor, mm: (2, D, N, 1), without lateral colour
     (2, D, N, W).
 
     The rays come from objects at distances (D,) mm through the centre of the pupil; vignetting factors are left out.
     """
-    lens = with_object_distance(lens, distances)
-    return sensor.landing(lens, fields, lens.primary[None] if lateral_colour else lens.wavelengths)
+    lens = aligned(with_object_distance(lens, distances), 2, exactly=True)
+    return landing_of(lens, fields[..., None], lens.primary[None] if lateral_colour else lens.wavelengths)
 
 
 def radii(points: Tensor, count: int) -> Tensor:
@@ -603,7 +618,7 @@ def _reach(lens: Lens, sensor: Sensor, fields: Tensor, distance: Tensor, *, tail
     """Largest distance in x or y, mm, of light from the origin of its kernel; tails: of Gaussians, too."""
     batch = scene(lens, fields, distance, lens.wavelengths)
     rays = trace_scene(batch, with_rim(*gauss_rings(8, 24, dtype=fields.dtype, device=fields.device))[0])
-    centre = origin(lens, sensor, fields, distance, lateral_colour=lateral_colour)[..., None]
+    centre = origin(lens, fields, distance, lateral_colour=lateral_colour)[..., None]
     offset = torch.where(rays.valid, rays.position[:2] - centre, torch.nan)
     reach = offset.abs().nan_to_num(0.0).max()
     if tails:

@@ -126,6 +126,34 @@ def transfer_functions(
     return transfer if origin == "pixel" else transfer * _half_pixels(kernels, shape)
 
 
+def pixel_means(picture: Tensor, factor: int) -> Tensor:
+    """Images (..., H/s, W/s) of pixels s times as large as those of images (..., H, W): means of s × s pixels.
+
+    Raises ValueError for rows and columns that are no multiples of the factor s.
+    """
+    if factor == 1:
+        return picture
+    rows, columns = picture.shape[-2:]
+    if rows % factor or columns % factor:
+        raise ValueError(f"{rows} × {columns} pixels: expected multiples of {factor}, the pixels to one of the sensor")
+    return picture.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor)).mean((-3, -1))
+
+
+def pixel_transfer(size: Sequence[int], factor: int) -> Tensor:
+    """B (rows, columns) of the mean over s × s pixels, on images of this size; the first of them is the origin.
+
+        B_f = 1/s² Σ_a exp(2πi f·a),   a = 0 … s - 1 on both axes
+
+    The image (`pixel_means`) is Y_f = 1/s² Σ_m B_m X_m, over the s² frequencies m that equal f modulo the sampling of
+    the large pixels (aliases).
+    """
+    a = torch.arange(factor, dtype=torch.float64)
+    rows, columns = (
+        torch.exp(2j * math.pi * torch.fft.fftfreq(n, dtype=torch.float64)[:, None] * a).mean(1) for n in size
+    )
+    return rows[:, None] * columns
+
+
 def extend(picture: Tensor, shape: Sequence[int], *, boundary: str) -> Tensor:
     """Images (..., H, W) extended to `shape`, one period of the continuation.
 

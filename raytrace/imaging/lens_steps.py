@@ -18,6 +18,7 @@ from raytrace.optimization.least_squares import Slope, SumOfSquares, TensorDesce
 from raytrace.optimization.lifted import OPTIONS, Lifted, descend
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.problem import Problem, typical_of
+from raytrace.tracing.compiled import prepare
 
 
 class LensSteps:
@@ -27,6 +28,7 @@ class LensSteps:
     """
 
     def __init__(self, variables: Variables, memory: dict | None = None):
+        prepare()
         self.variables, self.damping = variables, OPTIONS.damping
         rows = DefaultMerit("spot").rows(variables.free.lens)
         self.problem = Problem(variables.free, rows, variables.held_to)

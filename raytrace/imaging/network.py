@@ -83,8 +83,8 @@ class RedNet(nn.Module):
             features.append(x)
         last = len(self.decoder)
         for i, layer in enumerate(self.decoder, 1):
-            weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
-            x = conv2d(x, weight.flip(-2, -1).transpose(0, 1), bias, padding=1)
+            assert isinstance(layer, nn.ConvTranspose2d)
+            x = conv2d(x, layer.weight.flip(-2, -1).transpose(0, 1), layer.bias, padding=1)
             if i < last:
                 x = (x.add_(features[last - i - 1]) if i % 2 else x).relu_()
         return picture + x

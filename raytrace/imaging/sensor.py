@@ -185,16 +185,11 @@ class Sensor:
         """
         lens = as_lens(lens, "Sensor.landing")
         fields = _components(fields, "fields").to(lens.surfaces[-2].thickness)
-        known = torch.isfinite(fields.detach()).all(0)
-        fields = torch.where(known, fields, 0.0)
         if wavelengths is None:
             wavelength = lens.primary
         else:
-            wavelength, fields, known = wavelengths_of(lens, wavelengths), fields[..., None], known[..., None]
-        lens = aligned(lens, fields.dim() - 1, exactly=True)
-        rays = rays_of_field(lens, fields, torch.zeros_like(fields), wavelength=wavelength)
-        (points,), arrives = points_at(lens, wavelength, (len(lens.surfaces) - 1,))(rays)
-        return torch.where(arrives & known, points, torch.nan)
+            wavelength, fields = wavelengths_of(lens, wavelengths), fields[..., None]
+        return landing_of(aligned(lens, fields.dim() - 1, exactly=True), fields, wavelength)
 
     # -- colours -------------------------------------------------------------------------------------------------------
 
@@ -365,6 +360,16 @@ class Sensor:
         if height > rows or width > columns:
             raise ValueError(f"patches of {height} × {width} pixels on a sensor of {rows} × {columns} rows and columns")
         return height, width
+
+
+def landing_of(lens: Lens, fields: Tensor, wavelength: Tensor) -> Tensor:
+    """Points (2, ...) mm where the chief rays of fields (2, ...) at wavelengths (...) µm meet the sensor of a lens;
+    everything broadcasts. See `Sensor.landing`."""
+    known = torch.isfinite(fields.detach()).all(0)
+    fields = torch.where(known, fields, 0.0)
+    rays = rays_of_field(lens, fields, torch.zeros_like(fields), wavelength=wavelength)
+    (points,), arrives = points_at(lens, wavelength, (len(lens.surfaces) - 1,))(rays)
+    return torch.where(arrives & known, points, torch.nan)
 
 
 def _pair(numbers: Any, name: str, kind: type, expected: str) -> tuple:

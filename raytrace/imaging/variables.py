@@ -35,15 +35,14 @@ from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import safe_divide, to
 from raytrace.maths.sampling import gauss_rings
 from raytrace.maths.tangents import tangents_of, with_tangents
+from raytrace.optimization.conditions import Condition, conditions_in_unit, conditions_of
 from raytrace.optimization.glass_choice import catalogs_of, pool_of, with_glasses
-from raytrace.optimization.problem import Condition, conditions_in_unit
 from raytrace.optimization.variables import (
     BadHold,
     DesignVariables,
     bounds_of,
     constraint_words,
     design_variables,
-    name_of,
     split_constraint,
     split_words,
     varied,
@@ -233,7 +232,7 @@ _NEGLIGIBLE = 1e-9  # relative change of the power by a number that does not aff
 class Variable:
     """One number of a lens as a parameter.
 
-    name: as of `optimization.variables.name_of`, or "sensor" of the last thickness; start: its value in the lens; unit:
+    name: of `Vary`, or "sensor" of the last thickness; start: its value in the lens; unit:
     of the parameter, in the unit of the number. Thicknesses and decentres are in mm; numbers of the shape and tilts in
     the change that moves the surface by 1 mm of sag at its semi-diameter, so that a step has one meaning for all.
     The system aperture is in tenths of its number at the start, the temperature in 10 °C, the pressure in 0.1 atm.
@@ -264,6 +263,17 @@ class Held:
         return number
 
 
+def _of_lens(lens: Lens, words: Sequence[str]) -> list[str]:
+    """The conditions of a lens of other quantities than those of words of `hold`. Raises BadVariables."""
+    try:
+        stored, current = [c for c in lens.conditions if c.on and c.is_worded], lens.current_configuration
+        given = [word for word in words if word not in ("buildable", "catalog")] if stored else ()
+        others = conditions_of(lens, given)
+        return [str(condition) for condition in stored if not any(c.excludes(condition, current) for c in others)]
+    except BadHold as error:
+        raise BadVariables(str(error)) from error
+
+
 class Variables(Owned):
     """The variables of a lens as parameters: number = `Variable.start` + `Variable.unit` · parameter, 0 at the start.
 
@@ -274,7 +284,8 @@ class Variables(Owned):
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
         constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
-        "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`.
+        "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`, and so are the
+        conditions of the lens of other quantities.
     catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT.
     step: unit of the parameters: "sag" as of `Variable`, or "blur": the change that spreads the rays of all fields by
         1 mm, RMS about their centroids, so that a rate of an optimiser means the same blur for all numbers of any lens.
@@ -310,6 +321,7 @@ class Variables(Owned):
         self.conditions = tuple(word for word in words if word not in efl)
         self._all = _variables(self.design, vary)
         self.held = self._held(" ".join(efl))
+        self.conditions = (*_of_lens(self.design.lens, words), *self.conditions)
         self.variables = tuple(v for v in self._all if self.held is None or v is not self.held.by)
         self.names = tuple(variable.name for variable in self._all)
         lower, upper = bounds_of(lens, self.design.variables, bounds)
@@ -592,7 +604,7 @@ def _design(lens: Lens, vary: str | Sequence[str]) -> DesignVariables:
     for number in design.variables:
         if number.quantity == "glass" or (number.surface, number.quantity) == (0, "thickness"):
             raise BadVariables(
-                f"{option('vary', joined(vary))}: {name_of(number)} is a variable of optimize and jacobian alone"
+                f"{option('vary', joined(vary))}: {number.name} is a variable of optimize and jacobian alone"
             )
     return dataclasses.replace(design, lens=dataclasses.replace(design.lens, optimization_data=data))
 
@@ -602,7 +614,7 @@ def _variables(design: DesignVariables, vary: str | Sequence[str]) -> tuple[Vari
     BadVariables for a variable that changes nothing."""
     lens, last = design.lens, sensor(design.lens)
     naming = [word for word in split_words(vary) if "=" not in word and Vary(last, "thickness") in varied(lens, word)]
-    names = [name_of(number) for number in design.variables]
+    names = [number.name for number in design.variables]
     if naming and naming[-1] == "sensor":
         names = ["sensor" if name == f"thickness_{last}" else name for name in names]
     numbers = zip(names, design.variables, design.start.tolist(), strict=True)

@@ -33,6 +33,7 @@ from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import count
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import OF_LENS, modelled, parse_bounds, path_of
 from raytrace.system.poses import Pose, undone
 from raytrace.system.surface import SHAPE, Surface
 from raytrace.words import option
@@ -418,6 +419,58 @@ def _in_order(data: OptimizationData | None) -> OptimizationData | None:
     return dataclasses.replace(data, variables=tuple(variables), solves=tuple(solves))
 
 
+def written_variables(lens: Lens) -> str:
+    """The variables of a lens of one configuration, with their bounds, as "curvature_1 thickness_2:1.0..20.0"."""
+    variables = () if lens.optimization_data is None else lens.optimization_data.variables
+    return " ".join(
+        variable.name + (f":{variable.bounds[0]!r}..{variable.bounds[1]!r}" if variable.bounds else "")
+        for variable in variables
+        if variable.operand is None and variable.address not in OF_LENS
+    )
+
+
+def with_written_variables(lens: Lens, words: str, place: Place) -> Lens:
+    """The lens with the variables of a line of its file, each of them modelled."""
+    surfaces, variables = list(lens.surfaces), []
+    for word in words.split():
+        name, colon, _ = word.partition(":")
+        quantity, _, digits = name.rpartition("_")
+        surface = int(digits) if digits.isdecimal() else -1
+        if not 0 <= surface < len(surfaces):
+            message = f"variables: {shown(word)}, expected a number and its surface, 0 to {len(surfaces) - 1}"
+            raise LensFileError(f"{message}, as curvature_1 or thickness_2:1..20", place)
+        try:
+            bounds = parse_bounds(word)[name] if colon else ()
+            if quantity != "thickness":
+                surfaces[surface] = modelled(surfaces[surface], quantity)
+            path_of(surfaces[surface], quantity, f"surface {surface}: ")
+        except ValueError as error:
+            raise LensFileError(f"variables: {error}", place) from error
+        variables.append(Vary(surface, quantity, bounds=bounds))
+    if not variables:
+        return lens
+    sized = tuple(k for k, surface in enumerate(surfaces) if surface.semi_diameter)
+    data = lens.optimization_data or OptimizationData(semi_diameters=sized)
+    data = dataclasses.replace(data, variables=tuple(variables))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces), optimization_data=data)
+
+
+def written_conditions(lens: Lens, place: Place) -> str:
+    """The conditions of a lens, in words, but for those that take values of other rows of its merit function."""
+    try:
+        return " ".join(str(condition) for condition in lens.conditions if condition.is_worded)
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
+
+
+def with_written_conditions(lens: Lens, words: str, place: Place) -> Lens:
+    """The lens with the conditions of a line of its file."""
+    try:
+        return lens.with_conditions(words)
+    except ValueError as error:
+        raise LensFileError(str(error), place) from error
+
+
 def changes(lens: Lens, again: Lens) -> list[str]:
     """The texts, configurations and optimisation data of a lens that its file does not bring back."""
     pairs: list[tuple[str, object, object]] = [
@@ -432,14 +485,6 @@ def changes(lens: Lens, again: Lens) -> list[str]:
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
     data, read_again = _in_order(lens.optimization_data), _in_order(again.optimization_data)
-    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
-        if read_again is not None:
-            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
-            both = zip(data.variables, read_again.variables, strict=False)
-            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
-            if unbound and free[0] == free[1]:
-                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
-                read_again = dataclasses.replace(read_again, variables=data.variables)
-        if read_again != data:
-            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
+    if data is not None and read_again != data and (data.rules or data.merit or data.tolerances):
+        pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
     return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

@@ -573,6 +573,7 @@ _OPTIONAL_KEYS = (
     "tolerances",
     "unread_tolerances",
     "geometry",
+    "conditions",
 )
 
 
@@ -585,7 +586,7 @@ class ImportReport(Result):
     (µm), ray_aiming: of the lens that was read. configurations: values of multi-configuration operands.
     variables, solves, kept: of `Lens.optimization_data`, in words; operands: of its merit function; tolerances: number
     of its lines; unread_tolerances: lines that are not read, with the reason. geometry: surfaces and gaps that cannot
-    be fabricated.
+    be fabricated. conditions: the lines of a table of conditions and boundaries, with the values of the lens.
     """
 
     file: str
@@ -607,6 +608,7 @@ class ImportReport(Result):
     tolerances: int = 0
     unread_tolerances: tuple[str, ...] = ()
     geometry: tuple[str, ...] = ()
+    conditions: tuple[str, ...] = ()
 
     def document(self) -> dict:
         return {name: part for name, part in asdict(self).items() if part or name not in _OPTIONAL_KEYS}
@@ -655,6 +657,9 @@ class ImportReport(Result):
             lines.append(f"  merit function of {sum(use.count for use in self.operands)} lines:")
         for status in dict.fromkeys(use.status for use in self.operands):
             lines += [f"    {status}:", *_wrapped([str(use) for use in self.operands if use.status == status])]
+        lines += (
+            ["  conditions and boundaries:", *(f"    {line}" for line in self.conditions)] if self.conditions else []
+        )
         lines += [f"  tolerances: {self.tolerances} lines, kept"] if self.tolerances else []
         return lines + [f"    not read: {line}" for line in self.unread_tolerances]
 

@@ -4,6 +4,7 @@ glass          dispersion formulas (`FORMULAS`), media and their refractive indi
 agf            the file format of glass catalogs, read and written
 catalogs       a glass by its name: order of the catalogs, aliases, suggestions
 environment    indices at a temperature and a pressure
+mounts         expansion of the materials of spacers, a row of `MOUNTS` each
 properties     `rt.glass`: catalog data, indices and thermal changes of a glass
 
 To add a formula: a function of coefficients and wavelength, and a row of `FORMULAS`. A catalog: its file in

@@ -5,4 +5,5 @@ from raytrace.materials.glass import MIRROR as MIRROR
 from raytrace.materials.glass import Glass as Glass
 from raytrace.materials.glass import internal_transmittance as internal_transmittance
 from raytrace.materials.glass import refractive_index as refractive_index
+from raytrace.materials.mounts import MOUNTS as MOUNTS
 from raytrace.materials.properties import glass as glass

@@ -7,7 +7,8 @@ merit             default merit functions, merit functions as values, their eval
 merit_of_batch    merit functions of a batch of lenses, with derivatives
 jacobian          derivatives of rays, merit functions and any function of a lens by its variables
 evaluate          the value of a merit function row by row, with its table and figure
-problem           constraint syntax; merit function and constraints as the sum of squares of the solver
+conditions        conditions of a lens: their syntax, their rows in its merit function, those that a call meets
+problem           merit function and conditions as the sum of squares of the solver
 least_squares     damped least squares (Levenberg–Marquardt) under bounds and conditions; L-BFGS-B of tensors
 optimize          `optimize`: opening and descent
 opening           rays brought through a lens at which most of them fail

@@ -1,3 +1,4 @@
+from raytrace.optimization.conditions import Condition as Condition
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
 from raytrace.optimization.merit import DefaultMerit as DefaultMerit
@@ -6,7 +7,6 @@ from raytrace.optimization.operands.operand import Conventions as Conventions
 from raytrace.optimization.operands.operand import Measure as Measure
 from raytrace.optimization.optimize import optimize as optimize
 from raytrace.optimization.optimized import Optimized as Optimized
-from raytrace.optimization.problem import Condition as Condition
 from raytrace.optimization.quantities import Kernels as Kernels
 from raytrace.optimization.quantities import Otf as Otf
 from raytrace.optimization.quantities import Points as Points

@@ -23,13 +23,11 @@ from raytrace.optimization.attained import (
     Attained,
     condition_rows,
     conditions_attained,
-    name_of_condition,
     rows_attained,
 )
 from raytrace.optimization.merit import arguments
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import NoProblem, Problem, typical_of
-from raytrace.optimization.variables import name_of
 from raytrace.words import option
 
 _EXCLUDED = 1e-7  # total miss of the linear program, conditions by their slopes
@@ -103,7 +101,7 @@ class _Conflict:
         if not any(need.slope.any() for need in self.needs):
             return "no variable moves it"
         excluded = "they exclude one another" if len(self.rows) > 1 else "it is out of reach"
-        names = [name_of(problem.model.variables[k]) for k in self.bounded]
+        names = [problem.model.variables[k].name for k in self.bounded]
         return f"{excluded} within the bounds of {_listed(names)}" if names else excluded
 
 
@@ -117,7 +115,7 @@ def _condition_text(problem: Problem, k: int) -> str:
     if k in rows:
         condition = problem.conditions[rows.index(k)]
         unit = problem.unit ** OPERANDS[condition.row.operand].length
-        return f"{name_of_condition(condition)}{condition.relation}{unit * problem.evaluation.rows[k].target:.6g}"
+        return f"{condition.quantity}{condition.relation}{unit * problem.evaluation.rows[k].target:.6g}"
     row = problem.rows[k]
     relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
     return f"{row.name} {arguments(row)}".strip() + f" {relation} {row.target:.6g} (row {k + 1})"

@@ -19,10 +19,11 @@ import numpy as np
 
 from raytrace.materials.glass import is_air
 from raytrace.optimization.between import worse_between
+from raytrace.optimization.conditions import Condition, conditions_in_unit
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.merit import Boundaries, DefaultMerit, merit_for
 from raytrace.optimization.opening import opened
-from raytrace.optimization.problem import Condition, NoProblem, conditions_in_unit, typical_of
+from raytrace.optimization.problem import NoProblem, typical_of
 from raytrace.optimization.search_tasks import (
     Journal,
     Minimum,
@@ -31,7 +32,7 @@ from raytrace.optimization.search_tasks import (
     TaskResult,
     descended,
 )
-from raytrace.optimization.variables import bounds_of, constraint_words, design_variables, name_of, split_constraint
+from raytrace.optimization.variables import bounds_of, design_variables, split_constraint
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import sensor
@@ -127,23 +128,23 @@ class FirstSearch(Protocol):
 class Plan:
     """A curriculum for a lens of plates: the search problem of every step.
 
-    vary: variables of the first step, by default the lens's; bounds, hold, merit: as for `search`. Raises NoProblem.
+    vary: variables of the first step, by default the lens's; bounds, merit: as for `search`; hold: all conditions.
+    Raises NoProblem.
     """
 
     kind: str
     lens: Lens
     vary: str | Sequence[str] | None
     bounds: str | Sequence[str] | None
-    hold: str | Sequence[str] | Sequence[Condition] | None
+    hold: Sequence[str | Condition]
     merit: DefaultMerit | None
 
     def __post_init__(self) -> None:
         if self.kind not in CURRICULA:
             raise NoProblem(f"{option('kind', self.kind)}: expected {', '.join(CURRICULA)}"
                             f"{did_you_mean(self.kind, CURRICULA)}")  # fmt: skip
-        listed = [self.hold] if isinstance(self.hold, str) else self.hold or ()
-        self.words = constraint_words([word for word in listed if isinstance(word, str)])
-        self.others = [condition for condition in listed if isinstance(condition, Condition)]
+        self.words = [word for word in self.hold if isinstance(word, str)]
+        self.others = [condition for condition in self.hold if isinstance(condition, Condition)]
         lens, held = self.lens, [word for word in self.words if word.startswith("efl=")]
         if not held:
             raise NoProblem(f"{option('kind', self.kind)} needs the focal length: {option('hold')} it, as efl=6")
@@ -164,7 +165,7 @@ class Plan:
         curved = [variable.surface for variable in free.variables if variable.quantity == "curvature"]
         if not curved:
             raise NoProblem(f"{option('kind', self.kind)}: no curvature varies: name them by {option('vary')}")
-        words = [name_of(variable).replace("_", ":") for variable in free.variables]
+        words = [variable.name.replace("_", ":") for variable in free.variables]
         if step.terms:
             places = ",".join(map(str, curved))
             free = design_variables(seen, [*words, *(f"{term}:{places}" for term in step.terms)])
@@ -194,12 +195,14 @@ class Plan:
 
 @dataclass
 class Growth:
-    """The steps of a plan from the minima of its first search; first: that search."""
+    """The steps of a plan from the minima of its first search; first: that search; ended: where steps from a minimum
+    ended before the last one, and why."""
 
     plan: Plan
     first: FirstSearch
     journal: Journal
     grown: list[tuple[SearchProblem, Minimum]] = field(default_factory=list)
+    ended: list[str] = field(default_factory=list)
 
     DONE: ClassVar[str] = "steps"
 
@@ -228,7 +231,7 @@ class Growth:
     def _grown(
         self, task: SearchProblem, minimum: Minimum, steps: Sequence[Step], bar: Any
     ) -> tuple[SearchProblem, Minimum] | None:
-        """The lens at the end of the steps from a minimum; None where one of them loses rays.
+        """The lens at the end of the steps from a minimum; None where one of them loses rays or misses a condition.
 
         A step whose start is far from this lens is taken in halves. The last step is repeated with denser fields and
         rays while spots are worse between them.
@@ -251,14 +254,22 @@ class Growth:
                 bar.update(int(number <= len(steps)))
                 bar.set_postfix_str(f"step {number}: merit {result.merit:.6g}")
             if not np.isfinite(result.merit) or result.lost:
+                self._end(minimum, step, f"failing rays in {result.lost:g} rows")
                 return None
             if not waiting and repeats < _REPEATS and worse_between(task.model.lens_at(result.x)):
                 waiting.append(replace(step, fields=2 * step.fields - 1, rings=step.rings + _MORE_RINGS))
                 repeats += 1
             if not waiting:
                 break
-        end = Minimum(result, minimum.task, seconds, minimum.descents)
-        return (task, end) if result.is_valid else None
+        if not result.is_valid:
+            self._end(minimum, step, "a condition is not met")
+            return None
+        return task, Minimum(result, minimum.task, seconds, minimum.descents)
+
+    def _end(self, minimum: Minimum, step: Step, reason: str) -> None:
+        """Note why the steps from a minimum ended."""
+        place = f"{step.aperture:.0%} of the aperture and {step.field:.0%} of the field"
+        self.ended.append(f"from minimum {minimum.task}: {reason} at {place}")
 
     @staticmethod
     def _is_far(task: SearchProblem, merit: float) -> bool:

@@ -1,6 +1,7 @@
 """The value of a merit function of a lens, row by row."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_sqrt, value
 from raytrace.maths.result import Column, Result, Table, rows
+from raytrace.optimization.attained import Attained, attained_by, table_of
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_of_batch import MeritOfBatch
 from raytrace.optimization.operands.table import OPERANDS
@@ -35,7 +37,8 @@ class MeritResult(Result):
     of those that have a value; values: (R,) mm, radians, waves … of the operands, lengths in its unit; targets,
     weights: (R,); contributions: (R,) parts of the square of the merit, which add up to 1; lost: (R,) bool, rows with a
     lost ray; configurations: (R,) of the rows. skipped: numbers of rows of unknown operands, which are left out. each:
-    whether the text lists every row.
+    whether the text lists every row. conditions: those of the lens and boundaries of its own merit function, with the
+    values that it has; rows of negative weight are conditions, no part of the merit.
     """
 
     lens: Lens
@@ -51,6 +54,7 @@ class MeritResult(Result):
     unit: float
     skipped: tuple[int, ...]
     each: bool = False
+    conditions: tuple[Attained, ...] = ()
 
     COLUMNS = property(
         lambda self: [Column(name, f"of the operand, lengths in {self.unit:g} mm") for name in ("target", "value")]
@@ -88,7 +92,8 @@ class MeritResult(Result):
         for row in results:
             row |= {"row": int(row["row"]), "configuration": int(row["configuration"]), "lost": bool(row["lost"])}
         head = {"merit": float(self.merit), "unit": self.unit, "skipped": [*self.skipped]}
-        return {"analysis": "merit", **head, "results": results}
+        conditions = [condition.document() for condition in self.conditions]
+        return {"analysis": "merit", **head, "results": results, **({"conditions": conditions} if conditions else {})}
 
     def tables(self) -> list[Table]:
         """A line for every row; in long tables for the rays of one field."""
@@ -114,7 +119,8 @@ class MeritResult(Result):
         }
         if len({*self.configurations.tolist()}) < 2:
             del columns[Column("conf.")]
-        return [Table(columns, lines)]
+        conditions = table_of(self.conditions)
+        return [Table(columns, lines, ["", *conditions] if conditions else [])]
 
     def _numbers(self, group: list[int]) -> str:
         first, last = (int(self.row[k]) for k in (group[0], group[-1]))
@@ -239,8 +245,10 @@ def evaluate(
     ]
     if lens.count is not None:
         return _of_batch(lens, function, shown)
-    evaluation = Evaluation(DesignVariables(lens), function.rows, **function.options)
+    free = [replace(row, weight=0.0) if row.weight < 0 else row for row in function.rows]
+    evaluation = Evaluation(DesignVariables(lens), free, **function.options)
     evaluated, like = evaluation(np.zeros(0)), torch.float64
+    weights = np.minimum(evaluation.weights, [row.weight for row in function.rows])
     return MeritResult(
         lens=lens,
         merit=torch.tensor(evaluated.merit, dtype=like),
@@ -248,13 +256,14 @@ def evaluate(
         row=torch.tensor([k + 1 for k in shown], dtype=torch.int64),
         values=torch.as_tensor(evaluated.values[shown], dtype=like),
         targets=torch.as_tensor(evaluation.targets[shown], dtype=like),
-        weights=torch.as_tensor(evaluation.weights[shown], dtype=like),
+        weights=torch.as_tensor(weights[shown], dtype=like),
         contributions=torch.as_tensor(evaluated.contributions(shown), dtype=like),
         lost=torch.as_tensor(evaluated.lost[shown]),
         configurations=torch.tensor([of_rows[k] for k in shown], dtype=torch.int64),
         unit=function.unit,
         skipped=evaluation.skipped,
         each=each,
+        conditions=attained_by(lens),
     )
 
 

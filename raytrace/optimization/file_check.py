@@ -8,6 +8,7 @@ from pathlib import Path
 from raytrace.io import ImportReport, LensFileError, Substitute, read_lens_with_report
 from raytrace.io.source import Place
 from raytrace.io.zemax.tolerances import read_lines
+from raytrace.optimization.attained import in_words
 from raytrace.optimization.operands.operand import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import Lens, check_media, glass_on_image
@@ -24,7 +25,8 @@ def check(
     substitute: Substitute = None,
 ) -> ImportReport:
     """The import report of a lens file: parts that were read and that were not, the source of each glass, the operands
-    that are evaluated, and surfaces and gaps that cannot be made (`tracing.geometry`).
+    that are evaluated, conditions and boundaries with the values of the lens, and surfaces and gaps that cannot be made
+    (`tracing.geometry`).
 
     strict: raise where something was assumed. configuration: the one that is traced. substitute: as for `read_lens`.
     Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
@@ -42,8 +44,9 @@ def check(
     if unused := glass_on_image(lens):
         note = f"surface {image}: light does not enter {unused}, the glass of the image: results are in front of it"
         notes = (*notes, note)
-    geometry = tuple(map(str, defects(lens)))
-    return dataclasses.replace(report, notes=notes, geometry=geometry, unread_tolerances=_unread_tolerances(lens))
+    geometry, unread = tuple(map(str, defects(lens))), _unread_tolerances(lens)
+    conditions = tuple(in_words(lens))
+    return dataclasses.replace(report, notes=notes, geometry=geometry, unread_tolerances=unread, conditions=conditions)
 
 
 def _unread_tolerances(lens: Lens) -> tuple[str, ...]:

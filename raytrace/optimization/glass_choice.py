@@ -31,8 +31,9 @@ from scipy.spatial import ConvexHull, QhullError
 from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
 from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.least_squares import Evaluate, SumOfSquares, least_squares
-from raytrace.optimization.problem import Condition, NoProblem, Problem
+from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.variables import DesignVariables, followers
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row, Solve, Vary

@@ -28,8 +28,9 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, Number, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.system.configurations import Operand, ScaledPath, with_entry
-from raytrace.system.lens import Lens, index_behind, is_round_about_axis, media, per_lens
+from raytrace.system.configurations import Operand, ScaledPath, taken, with_entry, with_operands
+from raytrace.system.expansion import expanded, growth, in_contact, is_solid
+from raytrace.system.lens import Lens, index_behind, is_round_about_axis, media, per_lens, temperature_of
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
     GLASS,
@@ -52,7 +53,7 @@ from raytrace.system.rays import Rays
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, is_flat, medium_surfaces, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of, structure_of
-from raytrace.tracing.geometry import edge_thickness, semi_diameter
+from raytrace.tracing.geometry import contact_heights, edge_thickness, semi_diameter
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import (
@@ -105,7 +106,8 @@ class DesignVariables:
         }
         if len(moved) < len(self.variables):
             raise UnknownNumber("a variable is named twice")
-        object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
+        lens = _with_picked_glasses(self.lens, self.variables, self.solves)
+        object.__setattr__(self, "lens", with_thermal_numbers(lens, self.solves))
 
     @cached_property
     def views(self) -> tuple["View", ...]:
@@ -144,7 +146,41 @@ class DesignVariables:
         view = self.views[lens.current_configuration - 1]
         lens = dataclasses.replace(lens, operands=tuple(operands))
         numbers = LensState(view, each, lens).tensors() if view.solves else view.numbers(each)
-        return with_numbers_of(lens, numbers, view.places)
+        return with_thermal_numbers(with_numbers_of(lens, numbers, view.places), self.solves)
+
+    @cached_property
+    def growths(self) -> dict[Solve, tuple[list[float], list[float]]]:
+        """Factors of surfaces and of media, as of `expansion.growth`, from the source of a thermal pickup to it."""
+        rules = [rule for rule in self.solves if rule.kind == "thermal"]
+        factors: dict[tuple[int, int], tuple[list[float], list[float]]] = {}
+        for source, configuration in {(rule.source, rule.configuration) for rule in rules}:
+            start, here = (with_operands(self.lens, number) for number in (source, configuration))
+            faces, behind = growth(start.surfaces, temperature_of(here) - temperature_of(start))
+            factors[source, configuration] = [*map(float, faces)], [*map(float, behind)]
+        return {rule: factors[rule.source, rule.configuration] for rule in rules}
+
+    def is_of_edges(self, rule: Solve) -> bool:
+        """Whether a thermal pickup is that of a space, whose thickness follows from the edges of its surfaces."""
+        if (rule.kind, rule.quantity) != ("thermal", "thickness"):
+            return False
+        surfaces = self.lens.surfaces
+        return not is_solid(surfaces[medium_surfaces(surfaces)[rule.surface]].glass)
+
+
+def with_thermal_numbers(lens: Lens, solves: Sequence[Solve]) -> Lens:
+    """The lens whose numbers with thermal pickups are those of their source, expanded."""
+    rules = [rule for rule in solves if rule.kind == "thermal"]
+    operands = list(lens.operands)
+    for source, configuration in dict.fromkeys((rule.source, rule.configuration) for rule in rules):
+        start, here = (with_operands(lens, number) for number in (source, configuration))
+        warmer = temperature_of(here) - temperature_of(start)
+        heights = contact_heights(start, in_contact(start.surfaces))
+        warm = dataclasses.replace(start, surfaces=expanded(start.surfaces, warmer, heights))
+        for rule in rules:
+            if (rule.source, rule.configuration) == (source, configuration) and rule.operand is not None:
+                operands[rule.operand] = taken(operands[rule.operand], warm, configuration - 1)
+    lens = dataclasses.replace(lens, operands=tuple(operands))
+    return with_operands(lens, lens.current_configuration) if rules else lens
 
 
 def _numbers_of(operand: Operand) -> Tensor:
@@ -192,6 +228,7 @@ class View:
         solves = [solve for solve in model.solves if solve.operand is None and solve.address not in overridden]
         solves = [solve for solve in solves if solve.quantity == "glass" or not self._is_idle(solve, lens)]
         solves = _with_glasses(solves, self.variables)
+        solves += [rule for rule in model.growths if rule.configuration == configuration and model.is_of_edges(rule)]
         self.solves = sorted(solves, key=lambda solve: (solve.surface, solve.quantity == "thickness"))
         moved = (*self.variables, *(solve.address for solve in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
@@ -235,9 +272,9 @@ class View:
                 return any(later.address != last for later in self.solves[position + 1 :])
             if solve.address == last:
                 return False
-            if solve.kind == "edge_thickness":
+            if solve.kind in ("edge_thickness", "thermal"):
                 shapes = any(quantity != "thickness" and surface > solve.surface for surface, quantity in solved)
-                return shapes or not any(solve.numbers[1:])
+                return shapes or (solve.kind == "edge_thickness" and not any(solve.numbers[1:]))
             return solve.surface < self.lens.stop or self.lens.aperture.kind in (
                 "image_f_number",
                 "paraxial_working_f_number",
@@ -388,6 +425,11 @@ def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int,
     pickups = [
         solve for solve in model.solves if solve.operand is not None and solve.kind == "pickup" and solve.numbers
     ]
+    pickups += [
+        dataclasses.replace(rule, scale=_grown(rule, *growths), offset=0.0)
+        for rule, growths in model.growths.items()
+        if not model.is_of_edges(rule)
+    ]
     for _ in pickups:
         for pickup in pickups:
             source, place = (int(pickup.numbers[0]), pickup.source), (pickup.operand, pickup.configuration)
@@ -401,6 +443,13 @@ def followed(model: DesignVariables, configuration: int) -> dict[int, tuple[int,
                 moved[place] = number, pickup.scale * scale, pickup.scale * offset + added
     here = {operand: linear for (operand, number), linear in moved.items() if number == configuration}
     return {operand: linear for operand, linear in here.items() if operand is not None}
+
+
+def _grown(rule: Solve, faces: list[float], behind: list[float]) -> float:
+    """The factor of a number with a thermal pickup: s of a thickness, 1/s of a curvature, s^(1-n) of a term of r^n."""
+    if rule.quantity == "thickness":
+        return behind[rule.surface]
+    return faces[rule.surface] ** (-1 if rule.quantity == "curvature" else 1 - int(rule.quantity[1:]))
 
 
 def _with_glasses(solves: Sequence[Solve], variables: Iterable[Address]) -> list[Solve]:
@@ -490,6 +539,31 @@ def _edge_thickness(state: "LensState", solve: Solve) -> Number:
     return state.through_torch(thickness)[0]
 
 
+def _thermal(state: "LensState", solve: Solve) -> Number:
+    """t′ = σ t + σ (z₂ - z₁) - (z₂′ - z₁′) of a space, t that of its source; z(h) = z′(s h)/s of a face grown by s."""
+    model, k = state.view.model, solve.surface
+    faces, behind = model.growths[solve]
+    σ, operand = behind[k], cast(int, solve.operand)
+    start = with_operands(model.lens, solve.source)
+    heights = contact_heights(start, in_contact(start.surfaces))
+
+    def from_edges(lens: Lens) -> list[Tensor]:
+        step = lens.surfaces[k].thickness.new_zeros(())
+        for j, sign in ((k, -1.0), (k + 1, 1.0)):
+            if j in heights:
+                surface, h, s = lens.surfaces[j], heights[j], faces[j]
+                cold, hot = (sag_at(surface, torch.zeros_like(h), grown * h) for grown in (s, σ))
+                step = step + sign * (σ / s * cold - hot)
+        return [step]
+
+    moved = followed(model, solve.source)
+    source: Number = float(_numbers_of(model.lens.operands[operand])[solve.source - 1])
+    if operand in moved:
+        number, scale, offset = moved[operand]
+        source = scale * state.variables[number] + offset
+    return σ * source + state.through_torch(from_edges)[0]
+
+
 def _power(state: "LensState", solve: Solve) -> Number:
     """c = P/(n′ - n) of the power that a surface has by its curvature."""
     k, n = solve.surface, state.index(state.primary)
@@ -525,6 +599,7 @@ SOLVES: dict[str, Callable[["LensState", Solve], Number]] = {
     "power": _power,
     "position": _position,
     "focal_length": _focal_length,
+    "thermal": _thermal,
 }
 
 

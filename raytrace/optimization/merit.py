@@ -306,7 +306,7 @@ class Merit:
         conventions: Conventions | str | Sequence[str] | None = None,
         skip_unknown: bool = False,
     ) -> "Merit":
-        """The merit function of the lens's file, with boundaries in mm (as of `DefaultMerit`) in addition.
+        """The merit function of the lens's file, with boundaries in mm (as of `DefaultMerit`) that it does not have.
 
         Raises BadMerit if the file has none.
         """
@@ -317,8 +317,9 @@ class Merit:
             lens.optimization_data.merit, lens.optimization_data.unit, conventions=conventions,
             skip_unknown=skip_unknown, boundaries=boundaries,
         )  # fmt: skip
-        limits = boundary_rows(lens, boundaries)
-        return stored + Merit(limits) if limits else stored
+        held = {in_unit(row, stored.unit, 1.0) for row in stored.rows}
+        limits = [row for row in boundary_rows(lens, boundaries) if row.operand == "CONF" or row not in held]
+        return stored + Merit(tuple(limits)) if any(row.operand != "CONF" for row in limits) else stored
 
     @classmethod
     def default(cls, lens: Lens, kind: str = "spot", **settings: Any) -> "Merit":
@@ -348,7 +349,9 @@ class Merit:
             raise BadMerit("rows behind a row PRIM would be of that wavelength: join them the other way round")
         reset = (Row("CONF", (1, 0)),) if any(row.operand == "CONF" for row in self.rows) else ()
         ahead = (*self.rows, *reset)
-        return dataclasses.replace(self, rows=(*ahead, *(_moved(row, len(ahead)) for row in behind)))
+        return dataclasses.replace(
+            self, rows=(*ahead, *(rereferenced(row, lambda n: n + len(ahead)) for row in behind))
+        )
 
     def __radd__(self, other: Sequence[Row]) -> "Merit":
         return Merit(tuple(other)) + self
@@ -453,15 +456,15 @@ def in_unit(row: Row, before: float, after: float) -> Row:
     return dataclasses.replace(row, target=row.target * (before / after) ** power) if power else row
 
 
-def _moved(row: Row, by: int) -> Row:
-    """A row moved down by some rows, with its references to other rows."""
+def rereferenced(row: Row, number: Callable[[int], int]) -> Row:
+    """A row with the new numbers of the rows that it refers to."""
     operand = OPERANDS.get(row.operand)
     if operand is None or operand.refers is None:
         return row
     probe = tuple(Row("EFFL") for _ in range(3))
     taken = operand.refers(Line(3, Row(row.operand, (1, 2)), 0), probe)  # [1], or [1, 2] of two rows and of a range
     first, second = row.integers
-    return dataclasses.replace(row, integers=(first + by, second + by if len(taken) > 1 else second))
+    return dataclasses.replace(row, integers=(number(first), number(second) if len(taken) > 1 else second))
 
 
 # -- evaluation --------------------------------------------------------------------------------------------------------
@@ -536,8 +539,8 @@ class Evaluation:
         counted = np.zeros(len(self.rows), dtype=bool)
         counted[[line.number - 1 for _, lines, _ in self.groups for line in lines]] = True
         self.weights = np.where(counted, [row.weight for row in self.rows], 0.0)
-        total = self.weights[self.weights > 0].sum()
-        self.factors = np.sqrt(np.abs(self.weights) / total) if total > 0 else np.zeros(len(self.rows))
+        total = self.weights[self.weights > 0].sum() or 1.0  # of conditions alone
+        self.factors = np.sqrt(np.abs(self.weights) / total)
         self.targets = np.array([row.target for row in self.rows])
 
     def _plan(self, skip_unknown: bool) -> list[int]:

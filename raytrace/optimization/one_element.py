@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from raytrace.edit.numbering import Numbering
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.operands.boundaries import BOUNDARIES
-from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.problem import Condition, NoProblem
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -27,8 +28,6 @@ from raytrace.optimization.search_tasks import (
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.words import option
-
-_SURFACES = ("surface", "place", "met surface", "contribution")  # of `operand.ARGUMENTS`
 
 
 @dataclass(frozen=True)
@@ -111,28 +110,14 @@ def _family(task: SearchProblem) -> tuple:
 # -- rows of a lens of other surfaces ----------------------------------------------------------------------------------
 
 
-def surface_arguments(row: Row) -> tuple[bool, bool]:
-    """Which of the two integers of a row are numbers of surfaces."""
-    if row.operand in BOUNDARIES:
-        return True, row.operand[:2] in ("MN", "MX")
-    first, second = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    return first in _SURFACES, second in _SURFACES
-
-
-def renumbered(rows: Sequence[Row], number: Callable[[int], int]) -> tuple[Row, ...]:
-    """Rows that name the same surfaces by their new numbers."""
-    return tuple(
-        replace(row, integers=(number(row.integers[0]) if first else row.integers[0],
-                               number(row.integers[1]) if second else row.integers[1]))
-        for row in rows
-        for first, second in [surface_arguments(row)]
-    )  # fmt: skip
-
-
-def conditions_renumbered(conditions: Sequence[Condition], number: Callable[[int], int]) -> tuple[Condition, ...]:
+def conditions_renumbered(conditions: Sequence[Condition], numbering: Numbering) -> tuple[Condition, ...]:
     """Conditions whose rows name the same surfaces by their new numbers."""
-    rows = renumbered([condition.row for condition in conditions], number)
-    return tuple(replace(condition, row=row) for condition, row in zip(conditions, rows, strict=True))
+    moved = ((condition, numbering.rows((*condition.before, condition.row))) for condition in conditions)
+    return tuple(
+        replace(condition, row=rows[-1], before=rows[:-1])
+        for condition, rows in moved
+        if len(rows) == len(condition.before) + 1
+    )
 
 
 def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Row, ...]:

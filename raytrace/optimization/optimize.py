@@ -17,27 +17,26 @@ from raytrace.maths.result import plain
 from raytrace.optimization.attained import Attained, NotReached, attained
 from raytrace.optimization.between import warn_of_worse, worse_between
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
+from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths
 from raytrace.optimization.loss import Loss, LossDescents
-from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit, merit_for
+from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit
 from raytrace.optimization.opening import Opened, opened
 from raytrace.optimization.optimized import AsBuiltChange, Optimized
 from raytrace.optimization.problem import (
-    Condition,
     ExpectationSettings,
     NoProblem,
     Problem,
-    conditions_in_unit,
     optimization_data_of,
     typical_of,
 )
 from raytrace.optimization.quantities import Quantity, quantity_of
-from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, name_of, without_glass
+from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, without_glass
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_points
-from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
@@ -64,7 +63,7 @@ def optimize(
     check_rings: int | None = None,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
-    hold: str | Sequence[str | Condition] | None = None,
+    hold: str | Sequence[str | Condition] | None = (),
     as_built: ExpectationSettings | None = None,
     cycles: int | None = None,
     seconds: float | None = None,
@@ -87,9 +86,11 @@ def optimize(
     exactly; None for none; restarts: descents from lenses displaced at random by a part of the width of their spots.
     The end is judged by denser rays (`Optimized`), of check_rings rings, by default twice as many.
     vary: variables, or their syntax, as "curvature thickness:5,6" (surfaces 5 and 6), by default the file's; bounds: of
-    variables, as "thickness:2..15" (mm); hold: constraints met exactly, as "efl=50 total_track<=80"
-    (`optimization.problem`). as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens
-    as a term of the merit. cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
+    variables, as "thickness:2..15" (mm); hold: conditions met exactly, as "efl=50 total_track<=80"
+    (`optimization.conditions`), in addition to `lens.conditions` and instead of those of the same quantity; None:
+    without those of the lens. The optimised lens has all of them.
+    as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit.
+    cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
     (`optimization.glass_choice`). log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
@@ -114,7 +115,7 @@ def optimize(
             raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
     model, glasses = without_glass(design_variables(lens, vary), vary)
-    names = tuple(map(name_of, model.variables))
+    names = tuple(variable.name for variable in model.variables)
     if not names:
         raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
     lower, upper = bounds_of(model.lens, model.variables, bounds)
@@ -150,8 +151,8 @@ def optimize(
     if loss is not None and (glasses or as_built is not None):
         given = option("vary", "glass") if glasses else option("as_built")
         raise NoProblem(f"{given} goes with a merit of rows, not with a function: leave it out")
-    rows = merit_for(lens, merit if loss is None else first or "spot")
-    conditions, of_rows = conditions_in_unit(lens, hold, rows.unit), rows.options
+    rows, held = specified(lens, merit if loss is None else first or "spot", hold)
+    conditions, of_rows = conditions_in_unit(lens, held, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, rows.rows, conditions, as_built=term, **of_rows)
     if is_stored:
@@ -169,9 +170,10 @@ def optimize(
     ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
     bounded = {name: pair for name, pair in ends.items() if not np.isinf(pair).all()}
 
+    data = optimization_data_of(model, problem.rows if loss is None else (), problem.unit, held)
+
     def lens_at(x: np.ndarray) -> Lens:
-        shown = problem.rows if loss is None else ()
-        return _lens_at(problem.model, x, rows=shown, unit=problem.unit, bounded=bounded)
+        return _lens_at(problem.model, x, data, bounded)
 
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
@@ -314,7 +316,7 @@ def _refuse_undefined(problem: Problem, start: Evaluated) -> None:
         raise NoProblem(f"row {k + 1} of the merit function, {row.name}, is {number:g} at the start")
     if not np.isfinite(start.jacobian).all():
         place, variable = np.argwhere(~np.isfinite(start.jacobian))[0]
-        k, name = int(start.of_row[place]), name_of(problem.model.variables[variable])
+        k, name = int(start.of_row[place]), problem.model.variables[variable].name
         raise NoProblem(
             f"row {k + 1} of the merit function, {problem.evaluation.rows[k].name}, has no derivative by {name} at "
             f"the start: {start.jacobian[place, variable]:g}"
@@ -323,20 +325,11 @@ def _refuse_undefined(problem: Problem, start: Evaluated) -> None:
         raise NoProblem("no row of the merit function has a value: no ray of them gets through the lens as it is")
 
 
-def _lens_at(
-    model: DesignVariables,
-    x: np.ndarray,
-    *,
-    rows: Sequence[Row] = (),
-    unit: float = 1.0,
-    bounded: dict[str, tuple] | None = None,
-) -> Lens:
-    """The lens with its optimisation data; bounded: the bounds of this optimisation, by variable."""
+def _lens_at(model: DesignVariables, x: np.ndarray, data: OptimizationData, bounded: dict[str, tuple]) -> Lens:
+    """The lens with optimisation data; bounded: the bounds of this optimisation, by variable."""
     lens = model.lens_at(x)
-    data = lens.optimization_data or optimization_data_of(model, rows, unit)
-    bounds = bounded or {}
     variables = tuple(
-        dataclasses.replace(variable, bounds=bounds.get(name_of(variable), variable.bounds))
+        dataclasses.replace(variable, bounds=bounded.get(variable.name, variable.bounds))
         for variable in data.variables
         if variable.address not in OF_LENS  # which no file holds
     )
@@ -366,7 +359,7 @@ def _optimized(
         lens=after,
         before=lens,
         merit=rows,
-        names=tuple(map(name_of, model.variables)),
+        names=tuple(variable.name for variable in model.variables),
         variables_before=tensor(model.start),
         variables_after=tensor(x),
         values_before=tensor(values[0]),

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column, Columns, Result, Table, number, plain, text_table
-from raytrace.optimization.attained import Attained
+from raytrace.maths.result import Column, Columns, Result, Table, number, plain
+from raytrace.optimization.attained import Attained, table_of
 from raytrace.optimization.between import Between
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.glass_choice import GlassStep
@@ -198,7 +198,7 @@ class Optimized(Result):
             Column("before", form=".8g"): self.variables_before,
             Column("after", form=".8g"): self.variables_after,
         }
-        conditions = self.conditions_in_words()
+        conditions = table_of(self.conditions)
         rows = self._largest_rows()
         rows = rows._replace(notes=[*rows.notes, *(["", *conditions] if conditions else [])])
         glasses = [_glass_table(self.glasses)] if self.glasses else []
@@ -250,29 +250,6 @@ class Optimized(Result):
         more = [f"and {len(left) - _SHOWN} more rows, {rest:.1%}"] if len(left) > _SHOWN else []
         return Table(columns, [""], more)
 
-    def conditions_in_words(self) -> list[str]:
-        """The table of targets and attained values of `shown_conditions`."""
-        shown = self.shown_conditions()
-        if not shown:
-            return []
-        remarks = [", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in shown]
-        lines = text_table(
-            {
-                Column("condition", form="<"): [row.name for row in shown],
-                Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in shown],
-                Column("reached"): [row.reached for row in shown],
-                Column("remark", form="<", heading=" "): remarks,
-            }
-        )
-        more = len(self.conditions) - len(shown)
-        return [*lines, f"and {more} more boundaries, met"] if more else lines
-
-    def shown_conditions(self) -> list[Attained]:
-        """The conditions that tables list: all but boundaries that are met, of which the first few are listed."""
-        chosen = [k for k, row in enumerate(self.conditions) if not row.met or not row.row]
-        met = [k for k, row in enumerate(self.conditions) if row.met and row.row]
-        return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
-
     def save(self, path: str | PathLike) -> None:
-        """Write the lens, with its variables and its merit function; a file does not hold the constraints of `hold`."""
+        """Write the lens, with its variables, its merit function and its conditions."""
         write_lens(self.lens, path)

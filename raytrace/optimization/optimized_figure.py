@@ -10,6 +10,7 @@ from raytrace.analysis.layout import draw_layout, on_one_scale
 from raytrace.analysis.panels import first_order_text
 from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.maths.numerics import detached
+from raytrace.optimization.attained import shown, table_of
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.loss import LossReport
 from raytrace.optimization.optimized import Optimized
@@ -30,7 +31,7 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 def optimize_report(result: Optimized) -> "Figure":
     """One page: the lens and its spots before and after in its configurations, on one scale, the merit by cycle, the
     largest contributions to it, and targets and attained values of conditions and boundaries."""
-    drawn, conditions = _drawn_configurations(result), result.shown_conditions()
+    drawn, conditions = _drawn_configurations(result), shown(result.conditions)
     count, below = len(drawn), 0.16 * (len(conditions) + 3) if conditions else 0.0
     heights = [2.8 * count, 4.2 * count, 2.9, *([below] if conditions else [])]
     figure = style.new_figure(10.0, 0.3 + sum(heights))
@@ -72,11 +73,11 @@ def _drawn_configurations(result: Optimized) -> list[tuple[str, Lens, Lens]]:
 
 def _draw_conditions(axes: "Axes", result: Optimized) -> None:
     """The table of targets and values reached; those not met are red."""
-    lines, shown = result.conditions_in_words(), result.shown_conditions()
+    lines, rows = table_of(result.conditions), shown(result.conditions)
     axes.axis("off")
     axes.set_title("Asked and reached", fontweight="bold", loc="left")
     for k, line in enumerate(lines):
-        missed = 0 < k <= len(shown) and not shown[k - 1].met
+        missed = 0 < k <= len(rows) and not rows[k - 1].met
         axes.annotate(
             line, (0.0, 1.0), (0, -11 * k - 4), xycoords="axes fraction", textcoords="offset points", va="top",
             fontsize=7.5, family="monospace", color="#b00020" if missed else style.INK,

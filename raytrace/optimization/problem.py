@@ -1,11 +1,6 @@
-"""Problem: a merit function and constraints over a model, as the sum of squares and conditions of the solver.
+"""Problem: a merit function and conditions over a model, as the sum of squares and conditions of the solver.
 
-Constraint syntax is "efl=50 total_track<=80 distortion<=2% bfd>=30": a name of WORDS, a relation and a number;
-efl@2=100 applies to configuration 2, thickness:3-5>=20 to the sum of these thicknesses, and REAY(8,0,0,1,0,0)=2 to any
-operand by its arguments. A name alone, as "efl", keeps the number of the lens as it is; distortion, a limit, does not
-become larger.
-
-Rows of positive weight are squared; rows of negative weight, and constraints, are conditions that are met exactly.
+Rows of positive weight are squared; rows of negative weight, and `conditions`, are met exactly.
 
 Failed rays are charged by the amount by which each misses the surface at which it fails, with derivatives that lead it
 back. A ray that misses a conic has a negative discriminant; for a totally reflected ray the sine of refraction is
@@ -18,217 +13,27 @@ the vertex sphere, c² r².
 """
 
 import dataclasses
-import re
+import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol, runtime_checkable
+from functools import cached_property, partial
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.analysis.chief import SAMPLES
 from raytrace.maths.numerics import Dual, Number, slope_of, value_of
+from raytrace.optimization.conditions import Condition, has_other_rows, stored_conditions, with_conditions
 from raytrace.optimization.least_squares import Sides, SumOfSquares
 from raytrace.optimization.lens_state import Bundle, Hits, LensState, Ray, View
-from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, in_unit
-from raytrace.optimization.operands.aberrations import unvignetted
+from raytrace.optimization.merit import LOST, Evaluated, Evaluation, RowOptions, in_unit, rereferenced
 from raytrace.optimization.operands.operand import Conventions
 from raytrace.optimization.operands.table import OPERANDS
-from raytrace.optimization.variables import (
-    BadHold,
-    DesignVariables,
-    constraint_words,
-    has_power,
-    split_constraint,
-)
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
-from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
-from raytrace.tracing.paraxial import largest_field
-from raytrace.words import RaytraceError, did_you_mean, option
-
-
-@dataclass(frozen=True)
-class Condition:
-    """A constraint: the value of a row related to its target, lengths in mm; in a configuration, 0 the current one.
-
-    relation: "=", "<=" or ">="; name: in tables, by default the operand of the row.
-    """
-
-    row: Row
-    relation: str = "="
-    configuration: int = 0
-    name: str = ""
-
-
-#: The arguments of a row: two integers and four numbers.
-Arguments = tuple[tuple[int, int], tuple[float, float, float, float]]
-
-_NONE: Arguments = ((0, 0), (0.0, 0.0, 0.0, 0.0))
-
-
-@dataclass(frozen=True)
-class Word:
-    """A quantity of constraint syntax: an operand with its arguments, in mm or `unit`."""
-
-    operand: str
-    text: str
-    unit: str = "mm"
-    arguments: Callable[[Lens], Arguments] = lambda lens: _NONE
-
-
-def conditions_of(lens: Lens, hold: str | Sequence[str] | None) -> tuple[Condition, ...]:
-    """The conditions of constraint syntax. Raises BadHold."""
-    return tuple(_condition(lens, word) for word in constraint_words(hold))
-
-
-def conditions_in_unit(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
-    """The conditions of `hold`, from mm to the unit of length of the merit function."""
-    listed = [hold] if isinstance(hold, str) else hold or ()
-    words = [word for word in listed if isinstance(word, str)]
-    values = [condition for condition in listed if isinstance(condition, Condition)]
-    conditions = (*conditions_of(lens, words), *values)
-    return tuple(dataclasses.replace(condition, row=in_unit(condition.row, 1.0, unit)) for condition in conditions)
-
-
-def _condition(lens: Lens, word: str) -> Condition:
-    name, configuration, relation, number = split_constraint(word)
-    if configuration > len(lens.configurations):
-        raise BadHold(
-            f"{option('hold')}: {word!r}: configuration {configuration}; this lens has {len(lens.configurations)}"
-        )
-    view = lens.configuration(configuration) if configuration else lens
-    if name in WORDS:
-        known = WORDS[name]
-        arguments = known.arguments(view)
-    elif sum_of := re.fullmatch(r"thickness:(\d+)(?:-(\d+))?", name):
-        first, last = int(sum_of[1]), int(sum_of[2] or sum_of[1])
-        if not 0 <= first <= last <= sensor(lens):
-            raise BadHold(f"{option('hold')}: {word!r}: this lens has gaps behind surfaces 0 to {sensor(lens)}")
-        known, arguments = Word("TTHI", "a sum of thicknesses"), ((first, last), _NONE[1])
-    elif operand := re.fullmatch(r"([A-Z][A-Z0-9]{3})(?:\(([^()]*)\))?", name):
-        if operand[1] not in OPERANDS:
-            raise BadHold(
-                f"{option('hold')}: {word!r}: no operand {operand[1]}{did_you_mean(operand[1], map(str, OPERANDS))}"
-            )
-        known, arguments = Word(operand[1], "", ""), _arguments(operand[2] or "", word)
-    else:
-        meant = f"; did you mean {_INSTEAD[name.lower()]}?" if name.lower() in _INSTEAD else did_you_mean(name, WORDS)
-        raise BadHold(
-            f"{option('hold')}: {word!r}: {name!r} is nothing to hold; expected one of {', '.join(WORDS)}{meant}"
-        )
-    bounds = OPERANDS[known.operand].bounds
-    if not number:
-        row = Row(known.operand, *arguments)
-        row = dataclasses.replace(row, target=_number_of(view, row, word))
-        return Condition(row, bounds or relation, configuration, name)
-    if bounds and relation != bounds:
-        raise BadHold(f"{option('hold')}: {word!r}: {name} is a limit on one side; expected {name}{bounds}{number}")
-    try:
-        target = float(number.removesuffix(known.unit) if known.unit else number)
-    except ValueError:
-        target = float("nan")
-    if not abs(target) < float("inf"):
-        unit = f" in {known.unit}" if known.unit else ""
-        raise BadHold(f"{option('hold')}: {word!r}: {number!r} is no number{unit}")
-    return Condition(Row(known.operand, *arguments, target=target), relation, configuration, name)
-
-
-def _number_of(lens: Lens, row: Row, word: str) -> float:
-    """The number of a row of a lens as it is. Raises BadHold."""
-    number = float(Evaluation(DesignVariables(lens), (row,))(np.zeros(0)).values[0])
-    if not np.isfinite(number):
-        raise BadHold(f"{option('hold')}: {word!r} keeps the number of the lens as it is, which is {number:g}")
-    return number
-
-
-def _arguments(text: str, word: str) -> Arguments:
-    """The arguments of a row from text: two integers, then up to four numbers."""
-    try:
-        numbers = [float(part) for part in text.split(",") if part]
-        first = [int(part) for part in numbers[:2]]
-    except ValueError:
-        numbers, first = [0.0] * 7, []
-    if len(numbers) > 6 or first != numbers[:2]:
-        raise BadHold(
-            f"{option('hold')}: {word!r}: expected two whole numbers and up to four numbers, as REAY(8,0,0,1,0,0)"
-        )
-    first, others = first + [0] * (2 - len(first)), numbers[2:] + [0.0] * (4 - len(numbers[2:]))
-    return (first[0], first[1]), (others[0], others[1], others[2], others[3])
-
-
-# -- arguments in a lens -----------------------------------------------------------------------------------------------
-
-
-def _behind_the_lens(lens: Lens) -> Arguments:
-    """The gaps from the last powered surface to the image."""
-    bending = [k for k in range(1, sensor(lens) + 1) if has_power(lens, k)]
-    return (max(bending, default=1), sensor(lens)), _NONE[1]
-
-
-def _chief_ray(lens: Lens) -> Arguments:
-    """The ray of the largest field through the centre of its pupil, vignetting applied, on the image."""
-    if not (extent := lens.fields.extent):
-        raise BadHold(f"{option('hold')}: all fields are on the axis: there is no off-axis chief ray")
-    x, y = (largest_field(lens)[:, 0] / extent).tolist()
-    return (len(lens.surfaces) - 1, 0), (x, y, 0.0, 0.0)
-
-
-def _through_stop(lens: Lens) -> Arguments:
-    """The ray of the largest field through the centre of the stop, without vignetting factors, on the image."""
-    surface, (x, y, *_) = _chief_ray(lens)
-    return surface, (x, y, *unvignetted(lens, (x, y)))
-
-
-def _curve(lens: Lens) -> Arguments:
-    """The fields of the curve of `analysis.chief.distortion`."""
-    return (0, 0), (0.0, float(SAMPLES), 0.0, 0.0)
-
-
-def _outer_colours(lens: Lens) -> Arguments:
-    """The shortest and the longest wavelength."""
-    return (int(lens.wavelengths.argmin()) + 1, int(lens.wavelengths.argmax()) + 1), _NONE[1]
-
-
-#: Names of quantities in other programs, and their name in constraint syntax.
-_INSTEAD = {
-    **dict.fromkeys(("bfl", "back_focal_length", "back_focal_distance"), "bfd"),
-    **dict.fromkeys(("focal_length", "effective_focal_length", "efy"), "efl"),
-    **dict.fromkeys(("ttl", "oal", "track", "length"), "total_track"),
-    **dict.fromkeys(("fno", "f#", "f/#"), "f_number"),
-    "epd": "entrance_pupil_diameter",
-    "na": "numerical_aperture",
-}
-
-#: Quantities of constraint syntax; each is the number of the analysis of that name.
-WORDS = {
-    "efl": Word("EFFL", "effective focal length"),
-    "f_number": Word("ISFN", "focal length / entrance pupil diameter", ""),
-    "working_f_number": Word("WFNO", "of the real cone on the axis", ""),
-    "numerical_aperture": Word("ISNA", "of the image, paraxial", ""),
-    "magnification": Word("PMAG", "paraxial, of an object at a finite distance", ""),
-    "angular_magnification": Word("AMAG", "paraxial, of the chief ray", ""),
-    "total_track": Word("TOTR", "from the first vertex to the image"),
-    "bfd": Word("TTHI", "from the last powered surface to the image", arguments=_behind_the_lens),
-    "image_height": Word(
-        "REAR",
-        "from the vertex of the sensor, of the ray of the largest field through the centre of the stop",
-        arguments=_through_stop,
-    ),
-    "paraxial_image_height": Word("PIMH", "of the largest field"),
-    "distortion": Word("DIMX", "the largest absolute value from the axis to the largest field", "%", _curve),
-    "petzval_radius": Word("PETZ", "of the image without astigmatism"),
-    "entrance_pupil_diameter": Word("EPDI", "of the beam"),
-    "entrance_pupil": Word("ENPP", "distance from surface 1"),
-    "exit_pupil": Word("EXPP", "distance from the image"),
-    "chief_ray_angle": Word("RAID", "between the chief ray of the largest field and the image's axis", "°", _chief_ray),
-    "lateral_colour": Word("LACL", "between the outer wavelengths", arguments=_outer_colours),
-    "axial_colour": Word("AXCL", "between the outer wavelengths", arguments=_outer_colours),
-}
-
+from raytrace.words import RaytraceError, option
 
 #: Weight of a miss of 1 relative to the charge for a failed ray, and the margin by which a ray is brought back.
 STEEP, MARGIN = 5.0, 0.1
@@ -373,8 +178,8 @@ class NoProblem(RaytraceError, ValueError):
     """An optimisation without variables, rows or light; the message says what is missing."""
 
 
-class Problem:
-    """The rows of a merit function, and conditions, over a model; `state` is the function of `least_squares`."""
+class Specification:
+    """The rows of a merit function, and conditions, over a model."""
 
     def __init__(
         self,
@@ -388,22 +193,34 @@ class Problem:
         as_built: Expectation | None = None,
     ):
         """unit: mm in the unit of length of rows and conditions; as_built: a term in addition to the rows, of the lens
-        in its current configuration, in proportion to the weights of all rows but boundaries. Raises NoProblem and
-        UnknownOperand."""
+        in its current configuration, in proportion to the weights of all rows but boundaries. Raises UnknownOperand."""
         self.as_built = as_built
         held = tuple(_held(model.lens, rows, conditions))
         self._settings: RowOptions = {"unit": unit, "skip_unknown": skip_unknown, "conventions": conventions}
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), **self._settings)
-        weights = self.evaluation.weights
+        signs = [0] * len(self.rows) + [sign for _, sign in held]
+        self.signs = np.where(self.evaluation.weights < 0, signs, 0)
+
+    def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
+        return self.evaluation(x, derivatives=derivatives)
+
+
+class Problem(Specification):
+    """A specification that is optimised; `state` is the function of `least_squares`.
+
+    Raises NoProblem where nothing varies, or no row counts.
+    """
+
+    def __init__(self, model: DesignVariables, *parts: Any, **settings: Any):
+        """parts, settings: of `Specification`."""
+        super().__init__(model, *parts, **settings)
         if not len(model.variables):
             raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
-        if not (weights > 0).any():
+        if not (self.evaluation.weights > 0).any():
             raise NoProblem(
                 f"no row of the merit function has a weight that counts: choose another by {option('merit')}"
             )
-        signs = [0] * len(self.rows) + [sign for _, sign in held]
-        self.signs = np.where(weights < 0, signs, 0)
         self.recovery = Recovery(self.evaluation)
 
     def through(self, opening: float) -> "Problem":
@@ -414,9 +231,6 @@ class Problem:
     def with_as_built(self, term: Expectation) -> "Problem":
         """The problem with the lens as built as a term."""
         return Problem(self.model, self.rows, self.conditions, as_built=term, **self._settings)
-
-    def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
-        return self.evaluation(x, derivatives=derivatives)
 
     def state(self, x: np.ndarray, derivatives: bool) -> SumOfSquares:
         """Residuals of rows of positive weight and of the lens as built, and violations of the other rows, in units of
@@ -535,22 +349,51 @@ class FunctionMerit:
         return value, slope
 
 
-def optimization_data_of(model: DesignVariables, rows: Sequence[Row], unit: float) -> OptimizationData:
-    """Optimisation data of a lens whose file has none; all semi-diameters that it has stay specified."""
-    given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
-    return OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
+def optimization_data_of(
+    model: DesignVariables, rows: Sequence[Row], unit: float, conditions: Sequence[Condition] = ()
+) -> OptimizationData:
+    """Optimisation data of an optimised lens: those of its file, and what that lacks of this optimisation: variables,
+    solves, rows of the merit function, boundaries that follow the rows of the file, and conditions, in mm.
+
+    Semi-diameters that a lens without any data has stay specified.
+    """
+    lens, data = model.lens, model.lens.optimization_data
+    if data is None:
+        data = OptimizationData(semi_diameters=tuple(k for k, s in enumerate(lens.surfaces) if s.semi_diameter))
+    of_lens, length = stored_conditions(lens), data.unit if data.rules or data.tolerances else unit
+    if has_other_rows(lens):
+        free = [dataclasses.replace(row, weight=0.0) if row.weight < 0 else row for row in data.merit]
+        is_extended, length = [*rows[: len(free)]] == free, data.unit
+        merit = (*data.merit, *(rows[len(free) :] if is_extended else ()))
+    else:
+        merit = tuple(in_unit(row, unit, length) for row in rows)
+    data = dataclasses.replace(
+        data,
+        variables=data.variables or model.variables,
+        solves=data.solves or model.solves,
+        merit=merit,
+        unit=length,
+    )
+    lens = with_conditions(dataclasses.replace(lens, optimization_data=data), of_lens)
+    return with_conditions(lens, conditions).optimization_data or data
 
 
 def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:
     """Rows of conditions and the signs of their relations; rows before them set configuration and primary wavelength,
     where the merit function or a condition does."""
-    if any(row.operand == "PRIM" for row in rows):
-        yield Row("PRIM", (0, lens.primary_wavelength)), 0
-    several = any(row.operand == "CONF" for row in rows) or any(condition.configuration for condition in conditions)
+    above = (*rows, *(row for condition in conditions for row in condition.before))
+    several = any(row.operand == "CONF" for row in above) or any(condition.configuration for condition in conditions)
+    primaries, count = any(row.operand == "PRIM" for row in above), len(rows)
     for condition in conditions:
-        if several:
-            yield Row("CONF", (condition.configuration or lens.current_configuration, 0)), 0
-        yield dataclasses.replace(condition.row, weight=-1.0), RELATIONS[condition.relation]
+        settings = [Row("PRIM", (0, lens.primary_wavelength))] if primaries else []
+        settings += [Row("CONF", (condition.configuration or lens.current_configuration, 0))] if several else []
+        start = count + len(settings)
+        last = dataclasses.replace(condition.row, weight=-1.0)
+        behind = partial(operator.add, start)
+        moved = [rereferenced(row, behind) for row in condition.before]
+        yield from ((row, 0) for row in (*settings, *moved))
+        yield (rereferenced(last, behind) if moved else last), RELATIONS[condition.relation]
+        count = start + len(moved) + 1
 
 
 def typical_of(model: DesignVariables) -> np.ndarray:

@@ -13,18 +13,21 @@ Deletion of elements is a step of automatic lens design in HappyLens (CVPR 2026)
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
+from raytrace.edit.numbering import Numbering
+from raytrace.edit.surfaces import without
 from raytrace.materials.glass import is_air
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.least_squares import SolverOptions
-from raytrace.optimization.one_element import Move, conditions_renumbered, renumbered, surface_arguments, thinned
-from raytrace.optimization.problem import Condition, NoProblem
+from raytrace.optimization.one_element import Move, conditions_renumbered, thinned
+from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.search_tasks import FOLLOW, LONG, SearchProblem, Stage, TaskResult, descended
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 from raytrace.words import option
@@ -70,7 +73,8 @@ def _objection(free: DesignVariables, conditions: Sequence[Condition], k: int) -
         return f"begins an element of curvatures that do not vary: name them by {option('vary')}"
     if any(solve.surface == k or (solve.kind == "pickup" and solve.source in faces) for solve in free.solves):
         return "begins an element with a solve, or one from which another number is picked up"
-    if any(_is_of(condition.row, k) for condition in conditions):
+    _, numbering = _without_element(lens, free, k)
+    if any(numbering.row(condition.row) is None for condition in conditions):
         return f"begins an element that {option('hold')} names"
     return ""
 
@@ -134,32 +138,25 @@ class Removal:
     def _without(self, x: np.ndarray) -> np.ndarray:
         """The variables of the lens without the element, from those of the lens with it."""
         moved = self._whole.model.lens_at(x)
-        return replace(self.reduced.model, lens=without_element(moved, self.k)).start
+        return replace(self.reduced.model, lens=_without_element(moved, self.task.model, self.k)[0]).start
 
     @cached_property
     def reduced(self) -> SearchProblem:
         """The search problem of the lens without the element."""
-        free, k, number = self.task.model, self.k, partial(_number, k=self.k)
-        lens, dropped = without_element(self.lens, k), 2 * k - _gap_kept(free, k)
-        gone = {(k, "curvature"), (k + 1, "curvature"), (k, "thickness"), (dropped, "thickness")}
+        free = self.task.model
+        lens, numbering = _without_element(self.lens, free, self.k)
         old = zip(free.variables, *self.task.bounds, strict=True)
         kept = [
-            (replace(variable, surface=number(variable.surface)), least, most)
-            for variable, least, most in old
-            if variable.address not in gone
+            (moved, least, most) for variable, least, most in old if (moved := numbering.variable(variable)) is not None
         ]
-        variables = tuple(variable for variable, _, _ in kept)
-        solves = tuple(_moved(solve, k) for solve in free.solves if (solve.surface, solve.quantity) not in gone)
-        if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
-            diameters = tuple(number(surface) for surface in data.semi_diameters if surface not in (k, k + 1))
-            stored = tuple(_moved(solve, k) for solve in data.kept if solve.surface not in (k, k + 1))
-            data = replace(data, variables=variables, solves=solves, merit=_rows(data.merit, k), kept=stored)
-            lens = replace(lens, optimization_data=replace(data, semi_diameters=diameters, tolerances=()))
+        variables, solves = tuple(variable for variable, _, _ in kept), numbering.solves(free.solves)
+        if (data := lens.optimization_data) is not None:
+            lens = replace(lens, optimization_data=replace(data, variables=variables, solves=solves))
         return replace(
             self.task,
             model=DesignVariables(lens, variables, solves),
-            rows=_rows(self.task.rows, k),
-            conditions=conditions_renumbered(self.task.conditions, number),
+            rows=numbering.rows(self.task.rows),
+            conditions=conditions_renumbered(self.task.conditions, numbering),
             bounds=(
                 np.array([least for _, least, _ in kept], dtype=float),
                 np.array([most for _, _, most in kept], dtype=float),
@@ -167,41 +164,6 @@ class Removal:
         )
 
 
-def without_element(lens: Lens, k: int) -> Lens:
-    """The lens without surfaces k and k + 1; the gap before the element has the thickness of all three."""
-    before, first, second = lens.surfaces[k - 1 : k + 2]
-    gap = replace(before, thickness=before.thickness + first.thickness + second.thickness)
-    stop = lens.stop - 2 if lens.stop > k + 1 else lens.stop
-    return replace(lens, surfaces=(*lens.surfaces[: k - 1], gap, *lens.surfaces[k + 2 :]), stop=stop)
-
-
-def _gap_kept(free: DesignVariables, k: int) -> int:
-    """The gap beside the element, k - 1 or k + 1, whose variable or solve is that of the gap without the element."""
-    if k == 1:
-        return 0
-    varied = {variable.address for variable in free.variables}
-    solved = {(solve.surface, solve.quantity) for solve in free.solves}
-    behind = (k + 1, "thickness")
-    is_last = k + 1 == sensor(free.lens)
-    return k + 1 if is_last or behind in solved or (k - 1, "thickness") not in varied | solved else k - 1
-
-
-def _number(surface: int, k: int) -> int:
-    """The number of a surface, or of the gap behind it, after surfaces k and k + 1 are gone."""
-    return surface if surface < k else k - 1 if surface <= k + 1 else surface - 2
-
-
-def _moved(solve: Solve, k: int) -> Solve:
-    return replace(solve, surface=_number(solve.surface, k), source=_number(solve.source, k))
-
-
-def _is_of(row: Row, k: int) -> bool:
-    """Whether a row is of the element alone: of one of its surfaces, or of its thickness."""
-    first, second = surface_arguments(row)
-    numbers = [number for number, is_surface in zip(row.integers, (first, second), strict=True) if is_surface]
-    return numbers in ([k], [k + 1], [k, k])
-
-
-def _rows(rows: Sequence[Row], k: int) -> tuple[Row, ...]:
-    """The rows of the lens without the element; rows of the element alone are left out."""
-    return renumbered([row for row in rows if not _is_of(row, k)], partial(_number, k=k))
+def _without_element(lens: Lens, free: DesignVariables, k: int) -> tuple[Lens, Numbering]:
+    """The lens without surfaces k and k + 1, and the new numbers of the others."""
+    return without(lens, k, k + 1, (*free.variables, *free.solves))

@@ -23,9 +23,10 @@ from functools import partial
 import numpy as np
 from scipy.linalg import null_space
 
+from raytrace.edit.surfaces import as_inserted, with_meniscus
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, SumOfSquares
-from raytrace.optimization.one_element import Move, conditions_renumbered, renumbered, thinned
+from raytrace.optimization.one_element import Move, conditions_renumbered, thinned
 from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.search_tasks import (
     FOLLOW,
@@ -37,7 +38,7 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Solve, Vary
+from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import is_posed
 from raytrace.words import option
@@ -85,49 +86,27 @@ def _objection(free: DesignVariables, k: int) -> str:
 
 def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
-    made, free, behind = with_meniscus(lens, k), task.model, partial(_behind, k=k)
+    made, free, numbering = with_meniscus(lens, k), task.model, as_inserted(lens, k, 2)
     new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
-    old = [replace(variable, surface=_behind(variable.surface, k)) for variable in free.variables]
+    old = numbering.variables(free.variables)
     bounds = {variable: (least, most) for variable, least, most in zip(old, *task.bounds, strict=True)}
     steep = bounds[next(variable for variable in old if variable.address == (k + 2, "curvature"))]
     bounds |= {variable: steep if variable.quantity == "curvature" else (-np.inf, np.inf) for variable in new}
     quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *old)))
     variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
-    solves = tuple(_moved(solve, k) for solve in free.solves)
-    if (data := lens.optimization_data) is not None:  # tolerances name surfaces by their old numbers
-        merit, kept = renumbered(data.merit, behind), tuple(_moved(solve, k) for solve in data.kept)
-        diameters = tuple(_behind(surface, k) for surface in data.semi_diameters)
-        data = replace(data, variables=variables, solves=solves, merit=merit, semi_diameters=diameters, kept=kept)
-        made = replace(made, optimization_data=replace(data, tolerances=()))
+    solves = numbering.solves(free.solves)
+    if (data := made.optimization_data) is not None:
+        made = replace(made, optimization_data=replace(data, variables=variables, solves=solves))
     return replace(
         task,
         model=DesignVariables(made, variables, solves),
-        rows=renumbered(task.rows, behind),
-        conditions=conditions_renumbered(task.conditions, behind),
+        rows=numbering.rows(task.rows),
+        conditions=conditions_renumbered(task.conditions, numbering),
         bounds=(
             np.array([bounds[variable][0] for variable in variables], dtype=float),
             np.array([bounds[variable][1] for variable in variables], dtype=float),
         ),
     )
-
-
-def with_meniscus(lens: Lens, k: int) -> Lens:
-    """The lens with a meniscus without thickness before surface k, of the adjacent glass; no ray changes."""
-    surface = lens.surfaces[k]
-    thin = replace(surface, thickness=0 * surface.thickness, apertures=(), comment="")
-    media = (surface, lens.surfaces[k - 1])  # behind the two new surfaces
-    new = [replace(thin, glass=medium.glass, environment=medium.environment) for medium in media]
-    stop = lens.stop + 2 if lens.stop >= k else lens.stop
-    return replace(lens, surfaces=(*lens.surfaces[:k], *new, *lens.surfaces[k:]), stop=stop)
-
-
-def _behind(surface: int, k: int) -> int:
-    """The number of a surface after two surfaces are inserted before surface k."""
-    return surface + 2 if surface >= k else surface
-
-
-def _moved(solve: Solve, k: int) -> Solve:
-    return replace(solve, surface=_behind(solve.surface, k), source=_behind(solve.source, k))
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------

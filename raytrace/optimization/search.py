@@ -28,21 +28,20 @@ from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.optimization.attained import conditions_attained
 from raytrace.optimization.between import between, warn_of_worse, worse_between
+from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.curriculum import Growth, Plan
 from raytrace.optimization.least_squares import SolverOptions
 from raytrace.optimization.loss import Loss, LossDescents
-from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, in_unit
 from raytrace.optimization.one_element import FromLens
 from raytrace.optimization.opening import opened
 from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
-    Condition,
     ExpectationSettings,
     NoLight,
     NoProblem,
     Problem,
-    conditions_in_unit,
     optimization_data_of,
     typical_of,
 )
@@ -264,9 +263,12 @@ def searched(
     )
 
 
-def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None) -> NoProblem:
-    """The error of a search without minima, with the nearest lens of all its descents, which is written."""
-    parts = [f"no lens without failing rays that meets {option('hold')}, from {starts} starts"]
+def _without_minima(
+    task: SearchProblem, journal: Journal, starts: int, folder: str | PathLike | None, ended: Sequence[str]
+) -> NoProblem:
+    """The error of a search without minima, with the nearest lens of all its descents, which is written; ended: where
+    the steps of a curriculum ended."""
+    parts = [f"no lens without failing rays that meets {option('hold')}, from {starts} starts", *ended]
     ends = [end for end in journal.known.values() if len(end.x) == len(task.model.start) and np.isfinite(end.merit)]
     if ends:
         nearest = min(ends, key=lambda end: end.rank)
@@ -289,7 +291,8 @@ def _without_minima(task: SearchProblem, journal: Journal, starts: int, folder: 
 def _design(problem: Problem, x: np.ndarray, name: str) -> Lens:
     """The lens at variables (n,), with its optimisation data."""
     design = problem.model.lens_at(x)
-    data = design.optimization_data or optimization_data_of(problem.model, problem.rows, problem.unit)
+    conditions = [replace(c, row=in_unit(c.row, problem.unit, 1.0)) for c in problem.conditions]
+    data = optimization_data_of(problem.model, problem.rows, problem.unit, conditions)
     return replace(design, name=name, optimization_data=data)
 
 
@@ -363,7 +366,7 @@ def search(
     merit: str | Merit | DefaultMerit | Sequence[Row] | None = None,
     vary: str | Sequence[str] | None = None,
     bounds: str | Sequence[str] | None = None,
-    hold: str | Sequence[str] | Sequence[Condition] | None = None,
+    hold: str | Sequence[str | Condition] | None = (),
     starts: int | None = None,
     insert: bool | Sequence[int] | None = None,
     delete: bool | Sequence[int] | None = None,
@@ -417,12 +420,14 @@ def search(
     if kind is not None:
         if merit is not None and not isinstance(merit, DefaultMerit):
             raise NoProblem(f"{option('kind', kind)} has a merit function of its own: leave {option('merit')} out")
-        plan = Plan(kind, lens, vary, bounds, hold, merit if isinstance(merit, DefaultMerit) else None)
+        _, held = specified(lens, DefaultMerit(), hold)
+        words = [str(condition) if condition.is_worded else condition for condition in held if condition.on]
+        plan = Plan(kind, lens, vary, bounds, words, merit if isinstance(merit, DefaultMerit) else None)
         task = plan.problem(lens, plan.curriculum.steps[0])
         starts = plan.curriculum.starts if starts is None else starts
     else:
-        function, free = merit_for(lens, merit), design_variables(lens, vary)
-        ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, hold, function.unit)
+        (function, held), free = specified(lens, merit, hold), design_variables(lens, vary)
+        ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, held, function.unit)
         glass, air = function.boundaries.glass, function.boundaries.air
         task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)
     if any(variable.quantity == "glass" for variable in task.model.variables):
@@ -455,7 +460,8 @@ def search(
     except KeyboardInterrupt:
         stopped = "interrupted"
     if not (each := run.each()):
-        raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None)
+        ended = run.ended if isinstance(run, Growth) else ()
+        raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None, ended)
     losses: list[float] = []
     if measured is not None:
         each, losses = _followed_by_loss(each, measured, run.journal, progress)

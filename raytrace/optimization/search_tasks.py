@@ -22,11 +22,12 @@ import numpy as np
 import torch
 from scipy.stats import qmc
 
+from raytrace.optimization.conditions import Condition
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.merit import RowOptions
-from raytrace.optimization.problem import Condition, NoProblem, Problem
-from raytrace.optimization.variables import DesignVariables, name_of
+from raytrace.optimization.problem import NoProblem, Problem
+from raytrace.optimization.variables import DesignVariables
 from raytrace.shards import agreeing, share, total
 from raytrace.stores import DamagedLine, Kind, Records, listed, number, record, text
 from raytrace.system.identity import identity, unlike
@@ -389,7 +390,7 @@ class SearchProblem:
         """Dependencies of a search, for its journal."""
         return {
             **identity(self.model.lens),
-            "variables": [name_of(variable) for variable in self.model.variables],
+            "variables": [variable.name for variable in self.model.variables],
             "start": self.model.start.tolist(),
             "bounds": [self.space.lower.tolist(), self.space.upper.tolist()],
             "rows": [repr(row) for row in self.whole.evaluation.rows],

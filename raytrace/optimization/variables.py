@@ -95,7 +95,7 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
             raise BadVariables(f"the file has no variables: {option('vary')} names them, as 'curvature thickness'")
         return DesignVariables(lens, data.variables, of_file)
     listed = [vary] if isinstance(vary, str) else vary
-    variables: dict[str, Vary] = {name_of(variable): variable for variable in listed if not isinstance(variable, str)}
+    variables: dict[str, Vary] = {variable.name: variable for variable in listed if not isinstance(variable, str)}
     words = split_words([word for word in listed if isinstance(word, str)])
     if variables and not words:
         return DesignVariables(lens, tuple(variable for variable in listed if isinstance(variable, Vary)), of_file)
@@ -104,7 +104,7 @@ def design_variables(lens: Lens, vary: str | Sequence[str | Vary] | None = None)
         if "=" not in word:
             solved = set() if ":" in word or word == "sensor" else _addresses((*new, *of_file))
             variables |= {
-                name_of(variable): variable for variable in varied(lens, word) if not _addresses([variable]) & solved
+                variable.name: variable for variable in varied(lens, word) if not _addresses([variable]) & solved
             }
     if not variables:
         raise BadVariables(
@@ -193,13 +193,6 @@ def split_words(vary: str | Sequence[str]) -> list[str]:
     return re.sub(r"\s*([-=*+,(])\s*|\s*(\))", r"\1\2", joined(vary)).split()
 
 
-def name_of(variable: Vary) -> str:
-    """The name of a variable in bounds and tables: thickness_6, in configuration 2 thickness_6@2, aperture."""
-    if variable.address in OF_LENS:
-        return variable.quantity
-    return f"{variable.quantity}_{variable.surface}" + (f"@{variable.configuration}" if variable.configuration else "")
-
-
 def bounds_of(
     lens: Lens,
     variables: Sequence[Vary],
@@ -218,7 +211,7 @@ def bounds_of(
         groups = {name for name, quantities in GROUPS.items() if variable.quantity in quantities}
         kinds = {variable.quantity, *groups}
         last = {"sensor"} if variable.address == (sensor(lens), "thickness") else set()
-        names.append({name_of(variable), *kinds, *(f"{kind}_{variable.surface}" for kind in kinds), *last})
+        names.append({variable.name, *kinds, *(f"{kind}_{variable.surface}" for kind in kinds), *last})
     for name, ends in ends_by_name.items():
         kind, _, surfaces = name.partition(":")
         wanted = {f"{kind}_{k}" for k in counted(name, surfaces)} if surfaces else {name}
@@ -310,12 +303,16 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 
 
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
-    """The variable of a number of a surface; where it differs between configurations, a variable for each of them."""
+    """The variable of a number of a surface; where it differs between configurations, a variable for each of them that
+    does not follow another by expansion."""
+    rules = () if lens.optimization_data is None else lens.optimization_data.solves
+    expanding = {(rule.operand, rule.configuration) for rule in rules if rule.kind == "thermal"}
     for position, operand in enumerate(lens.operands):
         addresses = [address for address, _ in addresses_of(lens, operand)]
         if operand.numbers is not None and (k, quantity) in addresses:
             first = addresses[0] if operand.paths[0].path[0] == "surfaces" else (k, quantity)  # the others follow it
-            return [Vary(*first, number, position) for number in range(1, len(operand.numbers) + 1)]
+            numbers = range(1, len(operand.numbers) + 1)
+            return [Vary(*first, number, position) for number in numbers if (position, number) not in expanding]
     return [Vary(k, quantity)]
 
 

@@ -419,9 +419,10 @@ def stream_kernels(
     shape, lens = scene.shape, scene.lens
     like = lens.surfaces[-2].thickness
     shots = []
-    for distance in lens.surfaces[0].thickness.flatten().unbind(0):
+    fields = scene.fields.expand(shape[0], 2, -1) if scene.fields.dim() == 2 else scene.fields.unbind(1)
+    for distance, some in zip(lens.surfaces[0].thickness.flatten().unbind(0), fields, strict=True):
         view = with_object_distance(lens, distance)
-        shots += streaming.shots_of(view, rays, scene.fields, scene.wavelengths, None, None)[0]
+        shots += streaming.shots_of(view, rays, some, scene.wavelengths, None, None)[0]
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))).expand(2, *shape)
     grids = [dataclasses.replace(grid, centre=c) for c in centre.flatten(1).unbind(1)]
     size = streaming.chunk_size(shots[0], max_bytes, kept=3 * 8 * len(shots) * grid.rows * grid.columns)

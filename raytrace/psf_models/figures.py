@@ -64,6 +64,7 @@ def close_up_of(psfs: Psf) -> CloseUp:
     times in width. Where waves would need too many samples, windows are smaller, down to the window of `psfs`.
     """
     half, centre = _windows(psfs)
+    places = psfs.fields.reshape(2, -1, half.shape[1]).expand(2, *half.shape)
     plain = MODELS[psfs.model].plain is not None
     numbers: dict[str, Any] = {"rays": _RAYS, "order": None} if plain else {"order": psfs.order}
     parameters = psfs.parameters or MODELS[psfs.model].parameters()
@@ -75,7 +76,7 @@ def close_up_of(psfs: Psf) -> CloseUp:
             return psf(
                 psfs.lens,
                 model,
-                fields=psfs.fields[:, fields],
+                fields=places[:, distances, fields],
                 object_distances=psfs.object_distances[distances],
                 wavelengths=psfs.wavelengths,
                 wavelength_weights=psfs.wavelength_weights,
@@ -137,7 +138,10 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     if close_up is None and not psfs.framed and psfs.order is not None:
         close_up = close_up_of(psfs)
     distances = psfs.object_distances.tolist()
-    labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
+    if psfs.fields.dim() == 2:
+        labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
+    else:  # others for each object distance
+        labels = [f"field {number + 1}" for number in range(psfs.fields.shape[-1])]
     line = _LINE if psfs.wavelengths_summed or len(psfs.wavelengths) > 2 * _LINE else len(psfs.wavelengths)
     if not psfs.wavelengths_summed:
         labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in psfs.wavelengths.tolist()]

@@ -224,9 +224,10 @@ def psf(
     model: "auto", "paraxial", "fourier", "gaussian", "drt" or "wave", or a model with its numbers, as `DRT(rays=2000)`:
         rays: instead of a tolerance, about that many rays per kernel, the error estimated from half of them; order:
         instead, an order of the model, as in `Psf.order` of an earlier call: for loops; nothing is estimated.
-    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm, inf allowed; wavelengths:
-        (W,) µm with wavelength_weights: (W,); by default those of the lens. Kernels are summed over the wavelengths;
-        per_wavelength: each wavelength has a kernel, (D, F, W, rows, columns), of energy 1 for all its light.
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field, or (2, D, F), others for each object distance;
+        object_distances: (D,) mm, inf allowed; wavelengths: (W,) µm with wavelength_weights: (W,); by default those of
+        the lens. Kernels are summed over the wavelengths; per_wavelength: each wavelength has a kernel, (D, F, W, rows,
+        columns), of energy 1 for all its light.
     pixel, size: pitch in mm, 0.005 by default, and number, one or (rows, columns), 21 by default; grid: instead, pixels
         whose centre is (2,) or (2, D, F).
     center: origin of the grid's centre: "axis", "chief" (the chief ray at the primary wavelength) or "centroid" (of the
@@ -297,8 +298,9 @@ def psf(
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
     wavelengths = like if wavelengths is None else row(wavelengths)
     weights = torch.ones_like(wavelengths) if weights is None else row(weights)
-    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
-        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
+    D = len(distances)
+    if fields.dim() not in (2, 3) or fields.shape[:-1] != (2, D)[: fields.dim() - 1] or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F), or (2, {D}, F)")
     for parameter, values in (("object_distances", distances), ("wavelengths", wavelengths)):
         if values.dim() != 1 or not len(values):
             raise ValueError(f"{parameter} of shape {tuple(values.shape)}; expected one axis")
@@ -309,7 +311,7 @@ def psf(
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
-    D, F, W = len(distances), fields.shape[1], len(wavelengths) if per_wavelength else 1
+    F, W = fields.shape[-1], len(wavelengths) if per_wavelength else 1
     rows, columns = base.shape
     afford(
         _PIXEL_BYTES * D * F * W * rows * columns,
@@ -317,14 +319,15 @@ def psf(
         helps="ask for a smaller {size}, or fewer {fields} at once",
     )
     if order is None and execution.memo is None:
-        warn_of_filling(with_object_distance(lens, distances.min()), fields)
+        warn_of_filling(with_object_distance(lens, distances.min()), fields.flatten(1))
     shares = weights / weights.sum()
 
     def compute(chosen: Tensor) -> Psf:
         centre = base.centre[:, chosen] if base.centre.dim() > 1 and base.centre.shape[1] > 1 else base.centre
         part = lens if lenses in (None, len(chosen)) else one_lens(lens, chosen)
         drive = _driver(part, name, parameters, tol or 0.01, execution)
-        batch = scene(part, fields, distances[chosen], wavelengths, execution.memo)
+        places = fields if fields.dim() == 2 else fields[:, chosen]
+        batch = scene(part, places, distances[chosen], wavelengths, execution.memo)
         origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
         if center == "axis" or symmetry(batch) == "round":
             pass
@@ -354,7 +357,9 @@ def psf(
     # Only traced light can fail to arrive; light outside the window has arrived.
     if psfs.rays and not bool((psfs.energy > 0).any()) and not bool((psfs.ray_covariance != 0).any()):
         trial = with_object_distance(lens if lenses is None else one_lens(lens, 0), distances[0].detach())
-        failures = ray_failures(trial, trials, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+        failures = ray_failures(
+            trial, trials, fields=fields.flatten(1)[:, :1].detach(), wavelengths=wavelengths[:1].detach()
+        )
         reasons = "; ".join(filter(None, (failures.words(0, 0), beam_hint(trial))))
         raise EmptyPsf(f"no ray reaches the sensor: {reasons}")
     if normalise == "window":
@@ -370,9 +375,8 @@ def psf(
             where = f"object at {float(distance):g} mm, " if lenses is None else f"lens {number}, "
             prefix = where if len(distances) > 1 else ""
             trial = with_object_distance(lens if lenses is None else one_lens(lens, number), distance)
-            warn_of_failures(
-                trial, trials, failed, fields=fields.detach(), wavelengths=wavelengths.detach(), prefix=prefix
-            )
+            places = (fields if fields.dim() == 2 else fields[:, number]).detach()
+            warn_of_failures(trial, trials, failed, fields=places, wavelengths=wavelengths.detach(), prefix=prefix)
     return dataclasses.replace(
         psfs,
         lens=lens,
@@ -628,12 +632,8 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
             return kernels(scene, grid, **options)
         # Processes beyond the number of blocks repeat a block, so that all take part in all decisions.
         distances, fields, wavelengths = block = _block(scene.shape, cut, share.rank % math.prod(cut))
-        part = dataclasses.replace(
-            scene,
-            lens=one_lens(scene.lens, distances),
-            fields=scene.fields[:, fields],
-            wavelengths=scene.wavelengths[wavelengths],
-        )
+        part = scene.of(distances)
+        part = dataclasses.replace(part, fields=part.fields[..., fields], wavelengths=part.wavelengths[wavelengths])
         centre = grid.centre
         for axis, chosen in enumerate(block, 1):  # axes of length 1 hold for all
             if centre.dim() > 1 and centre.shape[axis] > 1:

@@ -80,7 +80,7 @@ def chief_ray_height(scene: Scene) -> Tensor:
     if is_on_axis(scene):
         return wavelengths.new_zeros(2, *scene.shape)
     beam = axial_beam(lens)
-    field, _ = object_field(lens, scene.fields[:, :, None], beam)
+    field, _ = object_field(lens, scene.fields[..., None], beam)
     distance, pupil = lens.surfaces[0].thickness, beam.entrance_pupil_position
     n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
     A, B, C, D = system_matrix(lens.surfaces[1:-1], n, wavelengths)

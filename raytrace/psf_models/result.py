@@ -143,7 +143,8 @@ class Psf(Result):
     waves: whether its light is diffracted; order: as for `DRT(order=…)`, None for independent rays; rays: traced for
     each kernel; reason: why `auto` chose the model, or a remark on convergence. normalised: "energy" (1 = all light
     through the entrance pupil) or "window" (each kernel sums to 1). wavelengths, wavelength_weights: (W,) µm and shares
-    of 1, that the kernels are summed over or have an axis of. lens, fields, object_distances: (2, F) and (D,) mm;
+    of 1, that the kernels are summed over or have an axis of. lens, fields, object_distances: (2, F), or
+    (2, D, F), and (D,) mm;
     parameters: of the model. framed: whether the pixels were specified; otherwise a figure shows the light itself,
     finely sampled.
     """
@@ -182,6 +183,11 @@ class Psf(Result):
         """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
         return self.kernel.dim() == 4
 
+    @property
+    def _fields(self) -> Tensor:
+        """Field points (2, ...) that broadcast to the axes of `energy`."""
+        return self.fields if self.wavelengths_summed else self.fields[..., None]
+
     def draw(self, **options: Any) -> Figure:
         """The kernels over object distance and field; options: as for `psf_models.figures.psf_grid`."""
         from raytrace.psf_models.figures import psf_grid
@@ -203,7 +209,7 @@ class Psf(Result):
         colours = {} if self.wavelengths_summed else {"wavelength": axis(self.wavelengths, 2, axes)}
         return {
             "object_distance": axis(self.object_distances, 0, axes),
-            **{f"field_{a}": axis(field, 1, axes) for a, field in zip("xy", self.fields, strict=True)},
+            **{f"field_{a}": field for a, field in zip("xy", self._fields, strict=True)},
             **colours,
             **{f"centroid_{a}": t for a, t in zip("xy", self.centroid, strict=True)},
             **{f"sigma_{a}_um": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
@@ -231,7 +237,7 @@ class Psf(Result):
         )
         return {
             "object_distance": number(self.object_distances[place[0]]),
-            "field": numbers(self.fields[:, place[1]]),
+            "field": numbers(self._fields.expand(2, *self.energy.shape).movedim(0, -1)[place]),
             **({} if self.wavelengths_summed else {"wavelength": number(self.wavelengths[place[2]])}),
             "centroid": numbers(centroid),
             "ray_centroid": numbers(ray_centroid),
@@ -251,7 +257,7 @@ class Psf(Result):
         )
         arrays = {name: getattr(self, name) for name in names}
         arrays |= {"psf": self.kernel, "centre": self.grid.centre, "object_distance": self.object_distances}
-        arrays |= {"field": self.fields.T, "pixel_pitch": self.grid.pitch}
+        arrays |= {"field": self.fields.movedim(0, -1), "pixel_pitch": self.grid.pitch}
         arrays = {name: t.detach().cpu().numpy() if isinstance(t, Tensor) else t for name, t in arrays.items()}
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
 

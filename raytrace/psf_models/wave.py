@@ -256,4 +256,4 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
 
 def one_field(scene: Scene, f: int) -> Scene:
     """One field of a scene, in double precision."""
-    return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
+    return to(dataclasses.replace(scene, fields=scene.fields[..., f : f + 1]), dtype=torch.float64)

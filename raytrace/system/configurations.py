@@ -13,6 +13,8 @@ from torch import Tensor
 
 from raytrace.materials.glass import Glass, label
 from raytrace.maths.numerics import Dataclass, value
+from raytrace.system.optimization_data import OptimizationData, Solve
+from raytrace.system.shapes import EVEN
 
 #: From a lens down to one of its parts: names of fields, positions in tuples, and a position (i, …) in a tensor.
 Path = tuple[str | int | tuple[int, ...], ...]
@@ -72,6 +74,8 @@ class Configured(Dataclass, Protocol):
     def operands(self) -> tuple[Operand, ...]: ...
     @property
     def current_configuration(self) -> int: ...
+    @property
+    def optimization_data(self) -> OptimizationData | None: ...
 
 
 Whole = TypeVar("Whole", bound=Configured)
@@ -154,6 +158,55 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
     if len(shapes) > 1 or any(len(shape) != 1 for shape in shapes):
         raise ValueError("expected lists of values of one length, a value per configuration")
     return with_operands(dataclasses.replace(lens, operands=tuple(operands)), 1)
+
+
+def at_temperatures(lens: Whole, warm: Sequence[Whole]) -> Whole:
+    """The lens, and the lens expanded at other temperatures, as configurations: see `Lens.with_temperatures`."""
+    if lens.operands:
+        raise ValueError(f"a lens of {count(lens.operands)} configurations; expected one: take `lens.configuration(1)`")
+    data = lens.optimization_data or OptimizationData()
+    solved = {solve.address for solve in data.solves}
+    numbers: list[tuple[str, int, int, str, Path]] = []
+    for k, surface in enumerate(lens.surfaces[:-1]):
+        if surface.sag_terms or surface.phase or surface.before or surface.after or surface.kind != EVEN:
+            message = "temperatures as configurations hold for centred conics and even aspheres"
+            raise ValueError(f"surface {k} is none: {message}; `lens.at(temperature=…)` takes all surfaces")
+        if surface.curvature is not None:
+            numbers.append(("CRVT", k, 0, "curvature", ("curvature",)))
+        if k:
+            numbers.append(("THIC", k, 0, "thickness", ("thickness",)))
+        terms = 0 if surface.coefficients is None else len(surface.coefficients)
+        numbers += [("PRAM", k, j + 1, f"a{2 * j + 2}", ("coefficients", (j,))) for j in range(terms)]
+    numbers = [row for row in numbers if (row[1], row[3]) not in solved]
+    states = (lens, *warm)
+    air: Path = ("environment", "temperature")
+    operands = [Operand("TEMP", paths=(ScaledPath(air),), numbers=_stacked(states, air))]
+    rules: list[Solve] = []
+    moved: dict[tuple[int, str], int] = {}
+    for name, k, parameter, quantity, inner in numbers:
+        path, index = ("surfaces", k, *inner), len(operands)
+        moved[k, quantity] = index
+        operands.append(Operand(name, k, parameter, (ScaledPath(path),), _stacked(states, path)))
+        rules += [
+            Solve(k, quantity, "thermal", (float(index),), 1, configuration=c, operand=index)
+            for c in range(2, len(states) + 1)
+        ]
+    fixed = [k for k, surface in enumerate(lens.surfaces[:-1]) if surface.semi_diameter]
+    for k in fixed:
+        words = tuple((state.surfaces[k].semi_diameter,) for state in states)
+        operands.append(Operand("SDIA", k, paths=(ScaledPath(("surfaces", k, "semi_diameter")),), words=words))
+    variables = tuple(
+        dataclasses.replace(vary, configuration=1, operand=moved[vary.address]) if vary.address in moved else vary
+        for vary in data.variables
+    )
+    data = dataclasses.replace(
+        data, variables=variables, solves=(*data.solves, *rules), semi_diameters=tuple({*data.semi_diameters, *fixed})
+    )
+    return with_operands(dataclasses.replace(lens, operands=tuple(operands), optimization_data=data), 1)
+
+
+def _stacked(states: Sequence[Any], path: Path) -> Tensor:
+    return torch.stack([part(state, path).reshape(()) for state in states])
 
 
 def kept(lens: Whole) -> Whole:

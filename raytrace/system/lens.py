@@ -6,7 +6,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from typing import Any, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,16 +22,21 @@ from raytrace.materials.environment import (
     unknown_change,
 )
 from raytrace.materials.glass import Glass, check_unit, check_wavelengths, is_air, label, refractive_index
+from raytrace.materials.mounts import expansion_of
 from raytrace.maths.numerics import broadcast_shape, check_precision, holds_numbers, in_transform, is_any, value, varies
 from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, ScaledPath
+from raytrace.system.expansion import expanded, growth, in_contact, is_solid, unexpanded
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean, option
+
+if TYPE_CHECKING:
+    from raytrace.optimization.conditions import Condition
 
 #: Units of a field point by the kind of field.
 FIELD_UNITS = dict(angle="degrees", object_height="mm", paraxial_image_height="mm", real_image_height="mm")
@@ -57,6 +62,8 @@ APERTURE_KINDS = {
 # -- results that several analyses of a lens share ---------------------------------------------------------------------
 
 P = ParamSpec("P")
+#: Radii of contact, mm, of surfaces of a lens by their numbers: `tracing.geometry.contact_heights`.
+Contact = Callable[["Lens", Sequence[int]], dict[int, Tensor]]
 T = TypeVar("T")
 _results: ContextVar[dict | None] = ContextVar("results", default=None)
 _MOST = 256  # results; the oldest is dropped first
@@ -402,6 +409,21 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
+    @property
+    def conditions(self) -> tuple["Condition", ...]:
+        """The conditions that optimisations meet exactly: rows of negative weight of the merit function, lengths
+        in mm, and those that are off. Raises BadHold for one of a surface that the lens does not have."""
+        from raytrace.optimization.conditions import stored_conditions
+
+        return stored_conditions(self)
+
+    def with_conditions(self, conditions: "str | Sequence[str | Condition]", *, only: bool = False) -> "Lens":
+        """The lens with conditions in addition, as "efl=50 total_track<=80 edge>=1" (`optimization.conditions`), each
+        instead of those of the same quantity; "off:efl=50" is stored and not met. only: no others. Raises BadHold."""
+        from raytrace.optimization.conditions import with_conditions
+
+        return with_conditions(self, conditions, only=only)
+
     def __getattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_ELSEWHERE.get(name, '')}", name=name, obj=self)
 
@@ -437,6 +459,7 @@ class Lens:
         ray_aiming: str | None = None,
         temperature: Tensor | float | None = None,
         pressure: Tensor | float | None = None,
+        mount: str | float | None = None,
         configuration: int | None = None,
     ) -> "Lens":
         """The same lens under other conditions; a condition that is None stays.
@@ -447,12 +470,23 @@ class Lens:
         unless wavelength_weights (W,) and primary_wavelength, its number from 1, are given; fields: y, or (x, y), in
         the lens's own kind, without vignetting factors, alike in weight unless field_weights (F,) are given; weights:
         relative;
-        temperature: °C, pressure: atm, 0 in vacuum; where one of the two is None, it stays, or is 20 °C or 1 atm. Warns
-        NoThermalCoefficients. configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
+        temperature: °C, pressure: atm, 0 in vacuum; where one of the two is None, it stays, or is 20 °C or 1 atm. From
+        one temperature to another indices change, and radii, thicknesses, aspheres and semi-diameters expand, as
+        `system.expansion` has it; a lens without an environment is one at 20 °C. mount: material of the spacers of all
+        spaces behind surface 1 without a stated `Surface.expansion`, of `materials.MOUNTS`, or 1e-6/K; without it they
+        keep their length. Warns NoThermalCoefficients.
+        configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
         Raises ValueError for conditions that no lens has.
         """
+        from raytrace.tracing.geometry import contact_heights
+
+        lens = self if configuration is None else self.configuration(configuration)
+        if mount is not None:
+            lens = with_mount(lens, mount)
+        if temperature is not None:
+            lens = with_expansion(lens, temperature, contact_heights)
         lens = multiple.freed(
-            self if configuration is None else self.configuration(configuration),
+            lens,
             **dict(object_distance=object_distance, sensor_distance=sensor_distance, f_number=f_number),
             **dict(entrance_pupil_diameter=entrance_pupil_diameter, wavelengths=wavelengths),
             **dict(wavelength_weights=wavelength_weights, primary_wavelength=primary_wavelength),
@@ -485,9 +519,29 @@ class Lens:
         if ray_aiming is not None:
             lens = dataclasses.replace(lens, ray_aiming=ray_aiming)
         if temperature is not None or pressure is not None:
-            lens = with_environment(lens, temperature, pressure)
+            changes = temperature is not None and not _is_at(self, temperature)
+            lens = with_environment(lens, temperature, pressure, expands=changes)
         check(lens)
         return lens
+
+    def with_temperatures(self, temperatures: Sequence[float], *, mount: str | float | None = None) -> "Lens":
+        """The lens with configurations: the first as it is, then one for each of these temperatures, °C.
+
+        Operands TEMP, CRVT, THIC, PRAM and SDIA hold its numbers, as OpticStudio's thermal pickups: in an optimisation
+        those of the first configuration vary, and the others follow by expansion. Solved numbers stay solved in every
+        configuration. Semi-diameters become fixed: there the spacers have contact. mount: as of `at`. Raises ValueError
+        for a lens with configurations, and for surfaces other than conics and even aspheres.
+        """
+        from raytrace.tracing.geometry import contact_heights
+
+        lens = with_environment(self if mount is None else with_mount(self, mount), None, None)
+        heights = contact_heights(lens, in_contact(lens.surfaces))
+        sizes = {k: float(height.detach()) or None for k, height in heights.items()}
+        surfaces = tuple(
+            dataclasses.replace(s, semi_diameter=sizes.get(k, s.semi_diameter)) for k, s in enumerate(lens.surfaces)
+        )
+        lens = dataclasses.replace(lens, surfaces=surfaces)
+        return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
 
     def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
@@ -546,6 +600,8 @@ def changed(surface: Surface, numbers: Mapping[str, Any], where: str, *, like: T
         if bool((radius == 0).any()):
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
+    if isinstance(given.get("expansion"), str):
+        given["expansion"] = expansion_of(given["expansion"])
     made: dict[str, Any] = {
         name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()
     }
@@ -657,18 +713,74 @@ def with_wavelengths(
     return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=1)
 
 
-def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: Tensor | float | None) -> Lens:
+def with_mount(lens: Lens, mount: str | float) -> Lens:
+    """The lens whose spaces behind surface 1 and further have spacers of a material of MOUNTS, or of 1e-6/K.
+
+    A stated `Surface.expansion` stays. Raises ValueError for an unknown material.
+    """
+    expansion, media = _like(expansion_of(mount), lens.wavelengths), medium_surfaces(lens.surfaces)
+
+    def mounted(k: int, surface: Surface) -> Surface:
+        is_spacer = 0 < k < len(media) - 1 and not is_solid(lens.surfaces[media[k]].glass)
+        return dataclasses.replace(surface, expansion=expansion) if is_spacer and surface.expansion is None else surface
+
+    return dataclasses.replace(lens, surfaces=tuple(mounted(k, surface) for k, surface in enumerate(lens.surfaces)))
+
+
+def temperature_of(lens: Lens) -> Tensor:
+    """°C, at which the lens has its radii and thicknesses: 20 °C without an environment."""
+    return (lens.environment or _reference(lens.wavelengths)).temperature
+
+
+def with_expansion(lens: Lens, temperature: Tensor | float, contact: Contact) -> Lens:
+    """The lens with the radii, thicknesses, aspheres and semi-diameters of another temperature, °C, in all its
+    configurations; its indices and its environment stay. contact: lens, surfaces -> their radii of contact, mm."""
+    temperature = _like(temperature, lens.wavelengths)
+
+    def grown(lens: Lens) -> Lens:
+        warmer = temperature - temperature_of(lens)
+        if not varies(warmer) and not is_any(warmer != 0):
+            return lens
+        surfaces = expanded(lens.surfaces, warmer, contact(lens, in_contact(lens.surfaces)))
+        lens = dataclasses.replace(lens, surfaces=surfaces)
+        if lens.aperture.kind != "float_by_stop":
+            return lens
+        size = lens.aperture.value * growth(lens.surfaces, warmer)[0][lens.stop]
+        return dataclasses.replace(lens, aperture=SystemAperture("float_by_stop", size))
+
+    if not lens.operands:
+        return grown(lens)
+    operands, each = list(lens.operands), range(multiple.count(lens.operands))
+    for k in each:
+        at_temperature = grown(multiple.with_operands(lens, k + 1))
+        operands = [multiple.taken(operand, at_temperature, k) for operand in operands]
+    current = grown(multiple.with_operands(lens, lens.current_configuration))
+    return dataclasses.replace(current, operands=tuple(operands))
+
+
+def _is_at(lens: Lens, temperature: Tensor | float) -> bool:
+    return not is_any(_like(temperature, lens.wavelengths) != temperature_of(lens))
+
+
+def with_environment(
+    lens: Lens, temperature: Tensor | float | None, pressure: Tensor | float | None, *, expands: bool = False
+) -> Lens:
     """The lens at another temperature in °C and pressure in atm; where one is None, it stays, or is 20 °C or 1 atm.
 
-    A surface with an environment of its own keeps it. Raises ValueError for a temperature or pressure that air cannot
-    have; warns NoThermalCoefficients, once for each glass whose change is not known.
+    Radii and thicknesses stay. A surface with an environment of its own keeps it. Raises ValueError for a temperature
+    or pressure that air cannot have; warns NoThermalCoefficients, once for each glass whose change is not known.
+    expands: whether the lens has expanded to that temperature, and glasses without an expansion are warned of, too.
     """
     before = lens.environment or _reference(lens.wavelengths)
     temperature = before.temperature if temperature is None else _like(temperature, lens.wavelengths)
     pressure = before.pressure if pressure is None else _like(pressure, lens.wavelengths)
     lens = dataclasses.replace(lens, environment=Environment(temperature, pressure))
     _check_environments(lens)
-    for number, message in unknown_changes(lens).items():
+    messages = unknown_changes(lens)
+    for number, name in unexpanded(lens.surfaces).items() if expands else ():
+        start = f"{messages[number]}; " if number in messages else f"{name}: "
+        messages[number] = f"{start}no expansion is listed: its radii and thickness stay"
+    for number, message in sorted(messages.items()):
         warnings.warn(f"surface {number}: {message}", NoThermalCoefficients, stacklevel=calling_level())
     return lens
 

@@ -32,6 +32,13 @@ class Vary:
     def address(self) -> tuple[int, str]:
         return self.surface, self.quantity
 
+    @property
+    def name(self) -> str:
+        """In bounds and tables: thickness_6, in configuration 2 thickness_6@2; aperture, temperature, pressure."""
+        if not self.surface and self.quantity != "thickness":
+            return self.quantity
+        return f"{self.quantity}_{self.surface}" + (f"@{self.configuration}" if self.configuration else "")
+
     def __str__(self) -> str:
         within = f" from {self.bounds[0]:g} to {self.bounds[1]:g}" if self.bounds else ""
         return f"{_where(self)}{within}"
@@ -56,6 +63,7 @@ class Solve:
     "power": the curvature by which the surface has the power numbers[0], in 1/mm.
     "focal_length": the curvature, or thickness, with which the lens has the effective focal length numbers[0] mm.
 
+    "thermal", between configurations: it follows its number in configuration `source` by expansion.
     "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
 
     All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):

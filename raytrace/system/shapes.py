@@ -214,6 +214,10 @@ TOROIDAL = Form(_toroid, _toroid_covers, _toroid_extent, _toroid_size)
 BICONIC = Form(_biconic, _biconic_covers, _biconic_extent, _size)
 
 
+#: Power of length of the first coefficients of kinds that are not round, and their sign on a turned surface.
+HEADS = {"curvature_x": (-1, -1), "conic_x": (0, 1)}
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
     """A kind of sag: a conic with rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or a form.
@@ -250,6 +254,15 @@ class Kind:
         """The name of a coefficient, counted from 0: a4 is that of r⁴, or of y⁴."""
         heads = len(self.heads)
         return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
+
+    def power_of(self, entry: int) -> int:
+        """The power of length in a coefficient, counted from 0."""
+        heads = len(self.heads)
+        return HEADS[self.heads[entry]][0] if entry < heads else 1 - self.step * (entry - heads + 1)
+
+    def sign_of(self, entry: int) -> int:
+        """The sign of a coefficient, counted from 0, on a surface that is turned around: z(x, y) -> -z(-x, y)."""
+        return HEADS[self.heads[entry]][1] if entry < len(self.heads) else -1
 
     @property
     def powers(self) -> str:

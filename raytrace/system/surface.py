@@ -45,6 +45,8 @@ class Surface:
     apertures: a ray must pass all of them.
     comment: free text of the file.
     environment: temperature and pressure of the medium behind the surface, where they are not the lens's.
+    expansion: linear expansion, 1e-6/K, of the spacer of the space behind the surface, or of a medium there whose
+        catalog lists none; None: none is stated, and the spacer keeps its length.
     """
 
     thickness: Tensor
@@ -62,6 +64,7 @@ class Surface:
     apertures: tuple[Aperture, ...] = ()
     comment: str = ""
     environment: Environment | None = None
+    expansion: Tensor | None = None
 
     @property
     def radius(self) -> Tensor:

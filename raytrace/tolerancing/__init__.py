@@ -1,7 +1,6 @@
 """Tolerancing: errors of manufacture as values, and lenses with such errors.
 
 table           `ToleranceTable`: rows, compensators and the wavelength of the test
-elements        elements and cemented groups of a lens, found from its media and mirrors
 perturbation    `perturbed`: the lens with an error for each row, one lens or many
 sampling        `draw_errors`: random errors, the same for a trial in any batch
 files           `read_tolerances`: the rows of a .zmx file

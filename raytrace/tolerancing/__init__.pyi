@@ -1,9 +1,9 @@
 from raytrace.tolerancing.analysis import ToleranceAnalysis as ToleranceAnalysis
 from raytrace.tolerancing.analysis import tolerance as tolerance
 from raytrace.tolerancing.as_built import AsBuilt as AsBuilt
-from raytrace.tolerancing.elements import cemented_groups as cemented_groups
-from raytrace.tolerancing.elements import lens_elements as lens_elements
 from raytrace.tolerancing.files import read_tolerances as read_tolerances
+from raytrace.tolerancing.grades import cemented_groups as cemented_groups
+from raytrace.tolerancing.grades import lens_elements as lens_elements
 from raytrace.tolerancing.grades import tolerances as tolerances
 from raytrace.tolerancing.jacobian import Jacobian as Jacobian
 from raytrace.tolerancing.jacobian import jacobian as jacobian

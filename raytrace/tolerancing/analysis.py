@@ -16,6 +16,7 @@ from raytrace.budget import afford
 from raytrace.io import write_lens
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
+from raytrace.optimization.attained import NotReached, attained_by
 from raytrace.optimization.merit import DefaultMerit, Merit
 from raytrace.plotting.style import GREY, INK, new_figure, styled
 from raytrace.shards import Share
@@ -446,6 +447,7 @@ def tolerance(
     checkpoint: a file (.jsonl) of finished trials, from which an interrupted study resumes.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
+    Warns NotReached of conditions of the lens that it does not meet before it is perturbed.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
     """
     if trials < 0:
@@ -461,6 +463,10 @@ def tolerance(
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
     if not 0 <= light_loss <= 1:
         raise ValueError(f"light_loss {light_loss:g}: expected a share of the light between 0 and 1, as 0.05")
+
+    for condition in attained_by(lens):
+        if not (condition.met or condition.row):
+            warnings.warn(f"the nominal lens: {condition}", NotReached, stacklevel=calling_level())
 
     def criterion_near(view: Lens, sampling: Sampling) -> Criterion:
         return criterion_of(criterion, view, sampling, model=model, pixel=pixel, size=size, merit=merit)

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from raytrace.materials.glass import has_abbe_number, is_air
+from raytrace.system.elements import cemented_groups, lens_elements
 from raytrace.system.lens import Lens
 from raytrace.system.parameter_paths import BadVariables, counted, joined
 from raytrace.system.tolerance_data import KINDS, TEST_WAVELENGTH, Compensator, Tolerance
-from raytrace.tolerancing.elements import cemented_groups, lens_elements
 from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.table import BadTolerance, ToleranceTable

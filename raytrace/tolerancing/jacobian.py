@@ -18,7 +18,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Columns, Result, Table
 from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
 from raytrace.optimization.merit import DefaultMerit, Evaluation, Merit, merit_for
-from raytrace.optimization.variables import DesignVariables, design_variables, name_of
+from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.system.lens import Lens, aligned
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.system.rays import Rays
@@ -175,7 +175,7 @@ def jacobian(
     return Jacobian(
         quantity,
         derivatives,
-        (*map(name_of, model.variables), *rows),
+        (*(variable.name for variable in model.variables), *rows),
         torch.as_tensor(np.concatenate([model.start, np.zeros(len(rows))])),
         {"points": "landing points"}.get(selected, selected)
         if isinstance(selected, str)

@@ -26,7 +26,7 @@ from torch.utils import _pytree as pytree
 from raytrace.maths.numerics import safe_divide, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.apertures import clearances_of, stands_inside
-from raytrace.system.lens import Lens, field_points, one_lens
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
@@ -234,7 +234,7 @@ def rule_near(
         (points, weights), count = moved.rule(rings), arms.kinks.count
     others = (~is_near).nonzero()[:, 0]
     for some in others.split(_TOGETHER) if len(others) else ():
-        chosen = scene if len(is_near) == 1 else dataclasses.replace(scene, lens=one_lens(scene.lens, some), memo=None)
+        chosen = scene if len(is_near) == 1 else dataclasses.replace(scene.of(some), memo=None)
         searched, shares = arms_of(chosen, count).rule(rings)
         more = searched.shape[-1] - points.shape[-1]
         points, weights = (torch.nn.functional.pad(t, (0, max(0, more))) for t in (points, weights))

@@ -179,8 +179,9 @@ def library() -> ctypes.CDLL:
                 if not _is_kept():  # else another process has compiled it meanwhile
                     if (folder / _file_name()).exists():
                         _say(f"{folder / _file_name()} can be another user's: compiled anew")
-                    with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
-                        os.replace(_build(Path(private)), folder / _file_name())
+                    if not _is_of_another_installation(folder):
+                        with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder) as private:
+                            os.replace(_build(Path(private)), folder / _file_name())
                     _remove_old(folder)
         except OSError as error:
             reason = _reason(error)
@@ -292,6 +293,22 @@ def _is_kept() -> bool:
     finally:
         os.close(folder)
     return True
+
+
+def _is_of_another_installation(folder: Path) -> bool:
+    """Whether another installation of this user, as a virtual environment, has compiled the same code; it is linked."""
+    digest = _file_name().rpartition("-")[2]
+    for path in sorted(folder.glob(f"{_of_this_machine()}*-{digest}")):
+        with suppress(OSError, NoCompiler):  # another user's, or linked to another torch
+            opened = open_folder(folder)
+            try:
+                check_file(path.name, opened)
+            finally:
+                os.close(opened)
+            _loaded(path)
+            os.link(path, folder / _file_name())
+            return True
+    return False
 
 
 def _reason(error: OSError) -> str:

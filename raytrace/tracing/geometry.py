@@ -14,6 +14,7 @@ Frames: position and rotation of every surface in the axes that rays start in.
 import dataclasses
 import math
 import warnings
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -130,6 +131,25 @@ def semi_diameter(lens: Lens, k: int) -> Tensor:
         return lens.wavelengths.new_tensor(size)
     factor, length = semi_diameter_margin(lens, k)
     return factor * per_lens(_reaches(lens, k)[-1]) + length
+
+
+def contact_heights(lens: Lens, numbers: Sequence[int]) -> dict[int, Tensor]:
+    """mm () of some surfaces from 1, as in `semi_diameters`, with derivatives; of a batch of lenses (L,).
+
+    A surface that no ray reaches and whose semi-diameter is not stored has its contact on the axis.
+    """
+    fixed = {k: lens.wavelengths.new_tensor(size) for k, size in fixed_semi_diameters(lens).items()}
+    free = [k for k in numbers if k not in fixed]
+    try:
+        reaches = _reaches(lens, max(free)) if free else []
+    except (ValueError, RuntimeError):
+        reaches = []
+    for k in free:
+        factor, length = semi_diameter_margin(lens, k)
+        stored = lens.wavelengths.new_tensor(lens.surfaces[k].semi_diameter or 0.0)
+        reach = factor * reaches[k - 1] + length if reaches else stored
+        fixed[k] = torch.where(torch.isfinite(reach), reach, stored)
+    return {k: fixed[k] for k in numbers}
 
 
 def _reaches(lens: Lens, last: int) -> list[Tensor]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.environment import in_words
+from raytrace.materials.environment import in_words as environment_in_words
 from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached, summary, value
 from raytrace.maths.result import Column, Result, Table, number, numbers
@@ -184,10 +184,12 @@ class Info(Result):
                     "semi_diameter": number(surface.semi_diameter),
                     "comment": surface.comment,
                     **_environment(surface),
+                    **({} if surface.expansion is None else {"expansion": number(surface.expansion)}),
                 }
                 for k, surface in enumerate(lens.surfaces)
             ],
             **({"geometry": geometry} if geometry else {}),
+            **({"conditions": conditions} if (conditions := self._conditions_in_words()) else {}),
         }
 
     def tables(self) -> list[Table]:
@@ -210,11 +212,18 @@ class Info(Result):
             f"  {'ray aiming':<24} {aiming}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
-            *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
+            *([f"  {'environment':<24} {environment_in_words(lens.environment)}"] if lens.environment else []),
             "",
         ]
         radius = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
-        return [Table({**self.columns(), "radius": radius}, lines)]
+        conditions = self._conditions_in_words()
+        return [Table({**self.columns(), "radius": radius}, lines, ["", *conditions] if conditions else [])]
+
+    def _conditions_in_words(self) -> list[str]:
+        """The conditions and boundaries of the lens, with the values that it has."""
+        from raytrace.optimization.attained import in_words
+
+        return in_words(detached(self.lens)) if self.lens.optimization_data else []
 
 
 def info(lens: Lens) -> Info:
@@ -307,6 +316,8 @@ def _remarks(lens: Lens, k: int) -> str:
     if k == len(lens.surfaces) - 1 and (unused := glass_on_image(lens)):
         parts.append(f"light does not enter {unused}")
     if surface.environment is not None:
-        parts.append(f"in {in_words(surface.environment)}")
+        parts.append(f"in {environment_in_words(surface.environment)}")
+    if surface.expansion is not None:
+        parts.append(f"expansion {float(surface.expansion):g}e-6/K")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))

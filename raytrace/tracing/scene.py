@@ -17,7 +17,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import afford_rays
 from raytrace.maths.numerics import broadcast_shape, in_transform, value, varies
 from raytrace.system.apertures import SHAPES, Aperture
-from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, with_object_distance
+from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, one_lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import SHAPE, gap_behind
 from raytrace.tracing.launch import rays_of_field, vignette
@@ -276,7 +276,8 @@ class Scene:
     """Object distance × field × wavelength: batch shape (D, F, W) of everything a model computes.
 
     lens: its object distance is (D, 1, 1), all finite or all inf, and of a batch so are other numbers; fields: (2, F)
-    in the lens's kind of field; wavelengths: (W,) µm; memo: stored rays of earlier scenes, if any.
+    in the lens's kind of field, or (2, D, F), others for each object distance or lens; wavelengths: (W,) µm; memo:
+    stored rays of earlier scenes, if any.
     largest: maximum of numbers () or (K,) over the whole scene that this one is a chunk of, by which decisions common
     to all its kernels are made. By default the scene is the whole.
     """
@@ -290,7 +291,12 @@ class Scene:
     @property
     def shape(self) -> tuple[int, int, int]:
         """(D, F, W)."""
-        return len(self.lens.surfaces[0].thickness), self.fields.shape[1], len(self.wavelengths)
+        return len(self.lens.surfaces[0].thickness), self.fields.shape[-1], len(self.wavelengths)
+
+    def of(self, distances: slice | Tensor) -> "Scene":
+        """The scene of some of the object distances or lenses."""
+        fields = self.fields if self.fields.dim() == 2 else self.fields[:, distances]
+        return dataclasses.replace(self, lens=one_lens(self.lens, distances), fields=fields)
 
     def everywhere(self, condition: Tensor) -> bool:
         """Whether a condition () holds in all of the whole scene."""
@@ -298,7 +304,7 @@ class Scene:
 
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
-    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm.
+    """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F), (2, D, F); wavelengths: (W,) µm.
 
     Of a batch of lenses (L,) there is an object distance for each, and D is L.
     """
@@ -340,7 +346,7 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
-    return aligned(scene.lens, 3), scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
+    return aligned(scene.lens, 3), scene.fields[..., None, None], scene.wavelengths[:, None], pupil
 
 
 def chief_landing(scene: Scene) -> Tensor:
@@ -393,13 +399,13 @@ def is_on_axis(scene: Scene) -> bool:
 
 
 def beam_share(scene: Scene) -> Tensor:
-    """Fraction (1, F, 1) of the entrance pupil that the vignetting factors of each field leave, (1 - VCX)(1 - VCY)."""
+    """Share (1 or D, F, 1) of the entrance pupil that vignetting factors of each field leave, (1 - VCX)(1 - VCY)."""
     _, along_x, along_y = _beams(scene)
-    return (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()[None, :, None]
+    return (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs().reshape(-1, scene.shape[1], 1)
 
 
 def _beams(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre and half axes (2, F) of the beams in the entrance pupil, vignetting factors applied."""
+    """Centre and half axes (2, F), (2, D, F) of the beams in the entrance pupil, vignetting factors applied."""
     corners = scene.fields.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    centre, x, y = vignette(scene.lens, scene.fields[:, :, None], corners).unbind(-1)
+    centre, x, y = vignette(scene.lens, scene.fields[..., None], corners).unbind(-1)
     return centre, x - centre, y - centre

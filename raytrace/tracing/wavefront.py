@@ -151,7 +151,7 @@ def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
             return rays, rays.valid | trace_scene(unclipped, with_chief).valid
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
     # A chief ray along the axis has the numbers of a failed ray, but is valid.
-    on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
+    on_axis = (scene.fields == 0).all(0)[..., None, None] & (with_chief[..., :1] == 0).all(0)
     return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
 
 

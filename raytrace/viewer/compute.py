@@ -24,6 +24,8 @@ from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached
 from raytrace.maths.result import masked, plain
 from raytrace.maths.sampling import hexapolar
+from raytrace.optimization.attained import Attained, attained_by
+from raytrace.optimization.conditions import OFF
 from raytrace.plotting import style
 from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, computed_once, field_label, field_points, shared
@@ -33,7 +35,7 @@ from raytrace.tracing.geometry import defects
 from raytrace.tracing.launch import unfilled
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
-from raytrace.viewer.state import State, shown_fields, slider_ends, word_of
+from raytrace.viewer.state import State, has_merit, shown_fields, slider_ends, word_of
 
 _detached = shared(detached)
 
@@ -309,6 +311,25 @@ def prescription(state: State) -> dict:
         "redo": len(state.future),
         "frequency": state.frequency,
         "merit": state.merit,
-        "file_merit": bool(data and data.merit),
+        "file_merit": has_merit(lens),
+        "conditions": _conditions(lens),
         "compare": state.compare,
     }
+
+
+def _conditions(lens: Lens) -> list[dict]:
+    """The conditions of a lens, and behind them the boundaries of its merit function, with the values that it has."""
+    try:
+        results, conditions = attained_by(lens), lens.conditions
+    except ValueError as error:  # of a surface that is gone
+        return [{"words": str(error), "row": 1, "on": True, "reached": None, "met": False}]
+    values = iter(results)
+    listed = []
+    for condition in conditions:
+        value = next(values) if condition.on else None
+        listed.append({"words": str(condition).removeprefix(OFF), "row": 0, "on": condition.on} | _reached(value))
+    return [*listed, *({"words": value.words, "row": value.row, "on": True} | _reached(value) for value in values)]
+
+
+def _reached(value: Attained | None) -> dict:
+    return {"reached": plain(value.reached) if value else None, "met": value is None or value.met}

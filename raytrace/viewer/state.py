@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.mtf import frequency_range
+from raytrace.optimization.conditions import Condition, conditions_of
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, arguments, merit_for
 from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.rays import RAYS
@@ -76,8 +77,7 @@ def initial(lens: Lens) -> State:
         highest = style.round_length(float(frequency_range(lens, shown_fields(lens), 2)[-1]))
     except ValueError:
         highest = 100.0
-    has_merit = data is not None and any(row.weight > 0 for row in data.merit)  # and not conditions alone
-    return State(lens, lens, tuple(words), "" if has_merit else "spot", frequency=highest)
+    return State(lens, lens, tuple(words), "" if has_merit(lens) else "spot", frequency=highest)
 
 
 def shown_fields(lens: Lens) -> Tensor:
@@ -173,6 +173,11 @@ def merit_of(state: State) -> Merit | None:
     frequencies = (state.frequency / 4, state.frequency / 2) if state.merit == "mtf" else ()
     chosen = merit_for(state.lens, DefaultMerit(state.merit, frequencies=frequencies))
     return dataclasses.replace(chosen, skip_unknown=True) + requirements(state.lens)
+
+
+def has_merit(lens: Lens) -> bool:
+    """Whether the file has a merit function, and not conditions alone."""
+    return lens.optimization_data is not None and any(row.weight > 0 for row in lens.optimization_data.merit)
 
 
 def requirements(lens: Lens) -> Merit:
@@ -410,10 +415,27 @@ def _step(state: State, source: str) -> State:
 
 
 def _merit(state: State, event: Mapping) -> State:
-    kind, data = event["kind"], state.lens.optimization_data
-    if kind not in KINDS and not (kind == "" and data and data.merit):
+    kind = event["kind"]
+    if kind not in KINDS and not (kind == "" and has_merit(state.lens)):
         raise ValueError(f"merit {kind!r}: expected one of {', '.join(KINDS)}")
     return dataclasses.replace(state, merit=kind)
+
+
+def _condition(state: State, event: Mapping) -> State:
+    """A new condition by its words, or another text, switch or the removal of a condition by its number, from 0."""
+    if "number" not in event:
+        return edited(state, state.lens.with_conditions(event["words"]))
+    conditions, number = [*state.lens.conditions], event["number"]
+    if not 0 <= number < len(conditions):
+        raise ValueError(f"condition {number + 1}: this lens has {len(conditions)}")
+    changed: list[Condition] = [] if event.get("remove") else [conditions[number]]
+    if "words" in event:
+        is_on = conditions[number].on
+        changed = [dataclasses.replace(c, on=is_on) for c in conditions_of(state.lens, event["words"])]
+    elif "on" in event:
+        changed = [dataclasses.replace(conditions[number], on=event["on"])]
+    conditions[number : number + 1] = changed
+    return edited(state, state.lens.with_conditions(conditions, only=True))
 
 
 _EDIT = {"surface": WHOLE, "quantity": TEXT, "value": NUMBER, "drag": FLAG}
@@ -431,6 +453,7 @@ EVENTS = {
     ),
     "frequency": Event({"value": NUMBER}, _frequency),
     "merit": Event({"kind": TEXT}, _merit),
+    "condition": Event({"words": TEXT, "number": WHOLE, "on": FLAG, "remove": FLAG}, _condition),
     "compare": Event({"on": FLAG}, lambda state, event: dataclasses.replace(state, compare=event["on"])),
     "undo": Event({}, lambda state, event: _step(state, "past")),
     "redo": Event({}, lambda state, event: _step(state, "future")),

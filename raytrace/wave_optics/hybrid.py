@@ -258,7 +258,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
     """Where the rays of pupil points meet the stop, (2, D, F, W, P) mm."""
     lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
+    field, wavelength = scene.fields[..., None, None], scene.wavelengths[:, None]
     rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
     return at_stop(lens, rays, wavelength)[0].expand(2, *scene.shape, pupil.shape[-1])
 

@@ -20,9 +20,9 @@ from raytrace.materials.glass import Glass
 from raytrace.maths.numerics import detached
 from raytrace.maths.sampling import gauss_legendre
 from raytrace.system.apertures import Aperture, reach
+from raytrace.system.elements import cemented_groups, lens_elements
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, is_round
-from raytrace.tolerancing.elements import cemented_groups, lens_elements
 from raytrace.tracing.geometry import edge_radius, rims, semi_diameters
 from raytrace.words import RaytraceError, option
 

@@ -24,9 +24,9 @@ from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table, plain
 from raytrace.plotting import style
 from raytrace.settings import DRAWINGS
+from raytrace.system.elements import cemented_groups
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.tolerancing.elements import cemented_groups
 from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tracing.lens_report import remarks

@@ -27,7 +27,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import BENT, MOST_POINTS, ONWARD, LensDraft, assemble, clear_aperture, poses_of
+from raytrace.io.assembly import (
+    BENT,
+    MOST_POINTS,
+    ONWARD,
+    LensDraft,
+    assemble,
+    clear_aperture,
+    poses_of,
+    with_written_conditions,
+    with_written_variables,
+)
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -140,6 +150,10 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
             draft.sources[quantity] = (keyword, record.place)
     lens = assemble(draft, file)
     _report_left_out(system, report)
+    for keyword, read_into in (("VARIABLES", with_written_variables), ("CONDITIONS", with_written_conditions)):
+        for record in parts.comments:
+            if record.keyword == keyword:
+                lens = read_into(lens, record.text, record.place)
     return lens
 
 
@@ -339,13 +353,16 @@ def _surface(
 ) -> Surface:
     """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
 
-    comments: of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase.
+    comments: of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase, EXPANSION
+    that of its spacer.
     """
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
     glass, is_break = _medium(block, before, library, report), "BREAK" in comments
-    stated = comments.get("RADIUS")
-    radius = number((stated.text or "?").strip(), "radius", stated.place) if stated else 1.0
+    radius, expansion = (
+        number((stated.text or "?").strip(), word.lower(), stated.place) if (stated := comments.get(word)) else None
+        for word in ("RADIUS", "EXPANSION")
+    )
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
     slope = block.number("CUY", "radius or curvature")  # 0 is a plane in both
@@ -354,7 +371,7 @@ def _surface(
         thickness=_thickness(block, unit),
         curvature=nonzero(1.0 / (slope * unit) if is_radius else slope / unit),
         **_conic_and_terms(block, unit),
-        phase=_phase(block, radius, unit),
+        phase=_phase(block, 1.0 if radius is None else radius, unit),
         before=ahead,
         after=behind,
         is_break=is_break,
@@ -362,6 +379,7 @@ def _surface(
         semi_diameter=semi_diameter,
         apertures=apertures,
         comment=unquoted(label.words[0]).strip() if label and label.words else "",
+        expansion=None if expansion is None else double(expansion),
     )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from raytrace.io.assembly import written_conditions, written_variables
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -107,6 +108,8 @@ def _comments(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     return [
         *(f"{start} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
         f"{start} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{start} catalogs",
+        f"{start} variables {variables}" if (variables := written_variables(lens)) else "",
+        f"{start} conditions {conditions}" if (conditions := written_conditions(lens, place)) else "",
         f"{start} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
         f"{start} unnamed {' '.join(unnamed)}" if unnamed else "",
     ]
@@ -188,6 +191,9 @@ def _surface(
         "  STO" if number == lens.stop else "",
         f"  SLB {label}" if label else "",
         f"  {COMMENT.lower()} break" if surface.is_break else "",
+        f"  {COMMENT.lower()} expansion {exact(surface.expansion, 'thermal expansion', place)}"
+        if surface.expansion is not None
+        else "",
         *_poses(surface, place),
         *_shape(surface, place),
         *([] if radial is None else _phase(radial, float(lens.primary), place)),

@@ -54,6 +54,7 @@ _SPELLINGS = {
     "stop": "stop, is stop, aperture stop, 絞り, 光阑, blende",
     "apertures": "aperture, apertures",
     "temperature": "temperature",
+    "expansion": "expansion, tce, tce x 1e6",
     "pressure": "pressure",
 }
 
@@ -64,7 +65,7 @@ _OTHERS = {
     "a size of the mechanical part": "mech semidia, mechanical semidiameter, mech diam, mech dia, mechanical diameter"
     ", chip zone, edge thickness, コバ厚",
     "a setting of the program": "ccy, cuc, thc, glc, spe, id no",
-    "coatings and heat refract no rays": "coating, tce, tce x 1e6, cte, specific gravity, density, 比重",
+    "coatings and heat refract no rays": "coating, cte, specific gravity, density, 比重",
 }
 
 

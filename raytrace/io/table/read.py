@@ -39,6 +39,8 @@ from raytrace.io.assembly import (
     clear_aperture,
     is_code,
     listed_glass,
+    with_written_conditions,
+    with_written_variables,
 )
 from raytrace.io.source import (
     MILLIMETRES,
@@ -213,6 +215,7 @@ def _surface(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Seq
             _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
         ),
         environment=environment_of(cells, place) if environment else None,
+        expansion=None if (stated := _cell(row, "expansion")) is None else double(stated),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
 
@@ -384,7 +387,8 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources
     places = {row.place.surface: row.place for row in rows}
     for surface, message in unknown_changes(lens).items():
         table.report.warn(message, places.get(surface, table.place))
-    return lens
+    lens = with_written_variables(lens, *table.metadata.get("variables", ("", table.place)))
+    return with_written_conditions(lens, *table.metadata.get("conditions", ("", table.place)))
 
 
 def _numbered(table: Table) -> list[Row]:

@@ -19,6 +19,8 @@
 # ray aiming: paraxial
 # temperature: 40                °C, of the glasses and the air
 # pressure: 1                    atm, of the air; 0 is vacuum
+# variables: curvature_1 thickness_2:1..20    with their bounds, mm and 1/mm
+# conditions: efl=100 edge>=1    met exactly by optimisations (`optimization.conditions`), mm
 """
 
 import math
@@ -29,7 +31,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.io.assembly import catalogs_needed, environment_at
+from raytrace.io.assembly import catalogs_needed, environment_at, written_conditions, written_variables
 from raytrace.io.source import (
     LensFileError,
     Place,
@@ -241,5 +243,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
         ("ray aiming", "" if lens.ray_aiming == "auto" else lens.ray_aiming),
         *written_environment(lens.environment, place).items(),
+        ("variables", written_variables(lens)),
+        ("conditions", written_conditions(lens, place)),
     ]
     return [(key, value) for key, value in lines if value]

@@ -37,7 +37,7 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
     """The columns of the table by heading; columns that would be empty are left out."""
     listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
     powers = sorted({n for row in listed for name in row if (n := order(name)) is not None})
-    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", *ENVIRONMENT, "comment"]
+    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", *ENVIRONMENT, "expansion", "comment"]
     used = [name for name in names if any(name in row for row in listed)]
     always = ["surface", "type", "curvature", "thickness", "glass"]
     return {name: [row.get(name, "") for row in listed] for name in always + used}
@@ -65,6 +65,8 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
     row |= written_environment(surface.environment, place)
+    if surface.expansion is not None:
+        row["expansion"] = exact(surface.expansion, "thermal expansion", place)
     return row | {"comment": quoted(surface.comment)} if surface.comment else row
 
 

@@ -68,7 +68,7 @@ from raytrace.system.configurations import Path as LensPath
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
-from raytrace.system.parameter_paths import parameter_paths
+from raytrace.system.parameter_paths import BadVariables, parameter_paths, parse_bounds
 from raytrace.system.surface import Surface
 
 
@@ -311,6 +311,31 @@ def rules_of(surfaces: Sequence[TypedSurface], report: Draft) -> list[Vary | Sol
     return [rule for typed in surfaces for rule in _rules(typed, surfaces, report)]
 
 
+_BOUNDS = "bounds:"
+
+
+def _with_bounds(variables: tuple[Vary, ...], merit: tuple[Row, ...]) -> tuple[tuple[Vary, ...], tuple[Row, ...]]:
+    """Variables with the bounds of the last row, a text of `_bounds_row`, and the rows without it."""
+    text = merit[-1].text if merit and merit[-1].operand == _TEXT else ""
+    try:
+        bounds = parse_bounds(text.removeprefix(_BOUNDS)) if text.startswith(_BOUNDS) else {}
+    except BadVariables:
+        bounds = {}
+    if not bounds:
+        return variables, merit
+    return tuple(dataclasses.replace(v, bounds=bounds.get(v.name, v.bounds)) for v in variables), merit[:-1]
+
+
+def _bounds_row(data: OptimizationData) -> tuple[Row, ...]:
+    """A row of text with the bounds of variables that no other line holds: thicknesses have VDSZ."""
+    words = [
+        f"{v.name}:{v.bounds[0]!r}..{v.bounds[1]!r}"
+        for v in data.variables
+        if v.bounds and (v.quantity != "thickness" or v.operand is not None)
+    ]
+    return (Row(_TEXT, text=f"{_BOUNDS} {' '.join(words)}"),) if words else ()
+
+
 def read(
     sections: Sections,
     lens: Lens,
@@ -341,11 +366,11 @@ def read(
         if not all(map(math.isfinite, (*solve.numbers, solve.scale, solve.offset))):
             message = f"a solve of the {solve.quantity}: a number is too large once converted to mm"
             raise LensFileError(message, surfaces[min(solve.surface, len(surfaces) - 1)].block.place)
-    kept = tuple(solve for solve in solves if not _is_followed(solve))
+    kept = tuple(solve for solve in solves if not _is_followed(solve, lens))
     for solve in kept:
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
     lines = [record for record in sections.tail if record.keyword in TOLERANCES]  # also behind the configurations
-    merit = merit_rows(tail, report)
+    variables, merit = _with_bounds(variables, merit_rows(tail, report))
     for record in lines:
         report.met(record.keyword, READ, record.place)
     states_none = all(record.keyword == "TOL" and record.words[:1] == (_NO_TOLERANCE,) for record in lines)
@@ -356,7 +381,7 @@ def read(
     )
     data = OptimizationData(
         variables,
-        tuple(solve for solve in solves if _is_followed(solve)),
+        tuple(solve for solve in solves if _is_followed(solve, lens)),
         merit,
         unit=millimetres if merit or tolerances or configured else 1.0,
         tolerances=tuple(tolerances),
@@ -372,7 +397,9 @@ def read(
     return dataclasses.replace(lens, optimization_data=None if data == OptimizationData(semi_diameters=sized) else data)
 
 
-def _is_followed(solve: Solve) -> bool:
+def _is_followed(solve: Solve, lens: Lens) -> bool:
+    if solve.kind == "thermal":
+        return lens.environment is not None and bool(re.fullmatch(r"thickness|curvature|a\d+", solve.quantity))
     if solve.operand is None:
         return solve.quantity != "semi_diameter" and solve.kind in _FOLLOWED
     # a pickup between configurations: of a quantity whose unit is known, or that needs none
@@ -506,7 +533,7 @@ def merit_lines(merit: Iterable[Row], place: Place) -> list[str]:
 
 def tail_lines(data: OptimizationData | None, place: Place) -> list[str]:
     """The lines of merit function and tolerances; TOFF where there are no tolerances."""
-    merit, tolerances = ((), ()) if data is None else (data.merit, data.tolerances)
+    merit, tolerances = ((), ()) if data is None else ((*data.merit, *_bounds_row(data)), data.tolerances)
     lines = [one_line(line, "a tolerance", place) for line in tolerances]
     return [*merit_lines(merit, place), *(lines or [f"TOL {_NO_TOLERANCE}   0   0 0 0   0 0 0 0 0"])]
 

@@ -67,7 +67,7 @@ SYSTEM_READ = by_word(
 _SURFACE_READ = by_word(
     {
         "read": "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR"
-        " PPAR PZUP MAZH TOLE EDGE"
+        " PPAR PZUP MAZH TOLE EDGE TCED"
     }
 )
 
@@ -103,7 +103,6 @@ SURFACE_IGNORED = by_word(
         "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MEMA",
         "edge of the mechanical part": "OEMA",
         "coatings refract no rays": "COAT",
-        "coefficient of thermal expansion": "TCED",
     }
 )
 TAIL_REASON = "behind the surfaces, and no line of a merit function, of tolerances or of configurations"
@@ -379,6 +378,7 @@ ROWS = {
     "APDY": ValueRow("surface", "OBDC", 2, "apertures.0.centre.1", 1, "decentre", SIZE),
     **_poses("B", "before"),
     **_poses("A", "after"),
+    "TCEX": ValueRow("surface", "TCED", 1, "expansion", 0, "thermal expansion"),
     "MCOM": ValueRow("surface", "COMM", 1, "comment", kind=TEXT),
     "XFIE": _field("x", "fields.x", 1),
     "YFIE": _field("y", "fields.y", 1),
@@ -1039,11 +1039,12 @@ def build(
             raise
         raise LensFileError(str(error), marked.place if marked else block.place) from error
     _report_unused(block, kind, row, report)
-    comment = block.last("COMM")
+    comment, stated = block.last("COMM"), block.last("TCED")
     return Surface(
         thickness=double(distance),
         semi_diameter=numbers.size,
         comment=comment.text.strip() if comment else "",
+        expansion=double(ROWS["TCEX"].read(stated)) if stated else None,
         **fields,
     )
 

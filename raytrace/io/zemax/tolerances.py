@@ -29,15 +29,18 @@ Components of a radial decentre and the terms of one irregularity are a group: a
 Every other operand is listed with the reason why it is not read.
 """
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from raytrace.io.source import LensFileError, Place, Record
+from raytrace.io.source import LensFileError, Place, Record, is_number, plain
 from raytrace.io.zemax.surfaces import in_millimetres, type_of, types
 from raytrace.system.configurations import count
+from raytrace.system.dimensions import power_at
 from raytrace.system.lens import Lens
+from raytrace.system.parameter_paths import modelled, path_of
 from raytrace.system.shapes import EVEN
 from raytrace.system.shapes import KINDS as KINDS_OF_SAG
 from raytrace.system.surface import is_even, sag_at
@@ -367,3 +370,131 @@ class _Reader:
             return k, f"a{2 * j}", in_millimetres(1.0, 1 - 2 * j, self.unit)
         self._leave(record, f"parameter {j} of surface {k} is no single number of the lens")
         return None
+
+
+# -- lines of a lens that is edited ------------------------------------------------------------------------------------
+
+#: What the whole numbers of a line number, where they are not a surface alone: a gap by the surface before it, the
+#: surfaces of an element, its seat, an operand of the configurations.
+_ARGUMENTS = {
+    **dict.fromkeys(("TIND", "TABB"), ("gap", "", "")),
+    "TTHI": ("gap", "gap", ""),
+    **dict.fromkeys(("TEDX", "TEDY", "TETX", "TETY", "TETZ", "TEDR"), ("element", "", "")),
+    **dict.fromkeys((*_ROLLS, "TRLR", "TARR"), ("element", "", "surface")),
+    **dict.fromkeys(("TMCO", "CMCO"), ("operand", "", "")),
+    **dict.fromkeys(("TOFF", "NOP", "TWAV", "STAT", "SAVE", "MPVT", "SEED"), ("", "", "")),
+}
+_MIRRORED = ("x", "z", "tilt_x", "tilt_z")  # motions that change their sign with a turn about y
+
+
+@dataclasses.dataclass(frozen=True)
+class ToleranceLine:
+    """A line of a tolerance: its operand, its three whole numbers, its limits, and its words as they are written."""
+
+    name: str
+    integers: tuple[int, int, int]
+    limits: tuple[float, float] = (0.0, 0.0)
+    words: tuple[str, ...] = ("0", "0", "0", "0", "0", "0", "0")
+
+    @staticmethod
+    def of(words: Sequence[str]) -> "ToleranceLine | None":
+        """The line of the words behind TOL; None where they are no such line."""
+        written = (*words[1:], *("0",) * max(0, 5 - len(words[1:])))
+        if not all(map(is_number, written[:5])):
+            return None
+        first, second, low, high, third = map(plain, written[:5])
+        return ToleranceLine(words[0], (int(first), int(second), int(third)), (low, high), written)
+
+    def __str__(self) -> str:
+        return " ".join([self.name, *self._written()[:2]])
+
+    def _written(self) -> list[str]:
+        """The words; those of numbers that have not changed are as they were."""
+        (first, second, third), (low, high) = self.integers, self.limits
+        numbers = (first, second, low, high, third)
+        changed = [
+            word if plain(word) == number else repr(number) for word, number in zip(self.words, numbers, strict=False)
+        ]
+        return [*changed, *self.words[5:]]
+
+    def line(self) -> str:
+        return " ".join(["TOL", self.name, *self._written()])
+
+    @property
+    def arguments(self) -> tuple[str, str, str]:
+        """What its whole numbers number."""
+        if self.name == "COMP" and self.integers[1] == 0:
+            return "gap", "", ""
+        return _ARGUMENTS.get(self.name, ("surface", "", ""))
+
+    @property
+    def has_pivot(self) -> bool:
+        """Whether it tilts an element about the pivot of MPVT."""
+        return self.name in ("TETX", "TETY")
+
+    def negated(self) -> "ToleranceLine":
+        """The line of the errors of opposite sign."""
+        low, high = self.limits
+        return dataclasses.replace(self, limits=(0.0 - high, 0.0 - low))
+
+    def scaled(self, factor: float) -> "ToleranceLine":
+        """The line with limits that are so many times as large."""
+        low, high = self.limits
+        return dataclasses.replace(self, limits=(low * factor, high * factor))
+
+    def sign(self, lens: Lens, of_number: Callable[[int, str], float]) -> float:
+        """-1 where the error has the opposite sign on a surface that is turned around; of_number: surface, name."""
+        if (name := self.quantity(lens)) is not None:
+            return of_number(self.integers[0], name)
+        if self.name in _ROLLS:
+            return -1.0 if _ROLLS[self.name][0] in _MIRRORED else 1.0
+        kind = _KINDS.get(self.name, "")
+        is_percent = kind == "radius" and self.integers[1] == 1
+        is_of_sag = kind in ("radius", "power", "curvature", "irregularity", "irregularity_angle") and not is_percent
+        return -1.0 if is_of_sag or (kind in KINDS and KINDS[kind].motion in _MIRRORED) else 1.0
+
+    def power(self, lens: Lens) -> int | None:
+        """The power of length in its limits; None where it is not known."""
+        if self.arguments[0] == "operand":
+            number, _, _ = self.integers
+            held = lens.operands[number - 1] if 1 <= number <= len(lens.operands) else None
+            return power_at(lens, held.paths[0].path) if held is not None and held.paths else None
+        if self.name in ("TPAR", "CPAR", "COMP") or self.name in _BREAKS:
+            name, k = self.quantity(lens), self.integers[0]
+            if name is None or not 0 <= k < len(lens.surfaces):
+                return None
+            surface = modelled(lens.surfaces[k], name)
+            return power_at(surface, path_of(surface, name).steps)
+        if self.name in _ROLLS or self.name in _RADIAL:
+            return 0 if self.name in ("TARX", "TARY", "TARR") else 1
+        kind = _TERMS.get(self.name, (_KINDS.get(self.name, ""),))[0]
+        if kind not in KINDS:
+            return None if self.arguments[0] and any(self.limits) else 0
+        return 0 if kind == "radius" and self.integers[1] == 1 else KINDS[kind].length
+
+    def quantity(self, lens: Lens) -> str | None:
+        """The name of the number of the lens that it changes, of COMP, CPAR, TPAR and TUDX; None for others."""
+        if self.name in _BREAKS:
+            return _BREAKS[self.name]
+        if self.name == "COMP":
+            return _COMPENSATORS.get(self.integers[1])
+        if self.name not in ("TPAR", "CPAR") or not 0 <= self.integers[0] < len(lens.surfaces):
+            return None
+        place = _Reader(lens)._name(Record(self.name, self.words, "", Place("tolerance line")))
+        return None if place is None else place[1]
+
+
+def rewritten(lines: Sequence[str], change: Callable[[ToleranceLine], Sequence[ToleranceLine]]) -> tuple[str, ...]:
+    """The lines of tolerances, each changed to others, or to none; a comment belongs to the line above it."""
+    kept: list[str] = []
+    is_left = True
+    for text in lines:
+        keyword, *words = text.split()
+        line = ToleranceLine.of(words) if keyword == "TOL" and words else None
+        if line is not None:
+            new = change(line)
+            is_left = bool(new)
+            kept += [text if other == line else other.line() for other in new]
+        elif keyword == "TOL" or is_left:
+            kept.append(text)
+    return tuple(kept)

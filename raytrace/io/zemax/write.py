@@ -188,6 +188,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         *_numbers(surface, types()[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
+        *([] if surface.expansion is None else [f"  TCED {ROWS['TCEX'].write(surface, place)} 0 0"]),
         *([] if surface.conic is None else [f"  CONI {ROWS['CONN'].write(surface, place)}"]),
         f'  DIAM {size} 0 0 1 ""',
         *_apertures(surface.apertures, place, ("surfaces", number, "apertures") in followed),

@@ -333,6 +333,7 @@ class Viewer {
     this.fieldKey = make("span", { className: "key" });
     this.readout = make("div", { className: "readout", hidden: true });
     this.problems = make("ul", { className: "problems", "aria-label": "remarks" });
+    this.held = make("section", { className: "held", "aria-label": "conditions" });
     this.root.classList.add("raytrace-viewer");
     const system = matchMedia("(prefers-color-scheme: dark)"), { body } = document;
     const paint = () => this.root.classList.toggle("dark", body.dataset.jpThemeLight ? body.dataset.jpThemeLight === "false" : system.matches || body.classList.contains("vscode-dark"));
@@ -347,7 +348,7 @@ class Viewer {
         make("span", { className: "group save" }, this.path, this.saving = button("Save", "", () => this.save()), make("label", { title: "write over a file that exists" }, this.replace, " replace"))),
       this.message,
       make("div", { className: "columns" },
-        this.left = make("div", { className: "left" }, this.conditions, this.table, this.problems),
+        this.left = make("div", { className: "left" }, this.conditions, this.table, this.held, this.problems),
         make("div", { className: "right" },
           panel("layout", "Layout", this.fieldKey),
           this.paraxial,
@@ -514,6 +515,25 @@ class Viewer {
     this.merit.value = lens.merit;
     this.show(this.frequency, words(lens.frequency), refused);
     for (const control of this.controls) control(lens, refused);
+    this.listHeld(lens.conditions, refused);
+  }
+
+  // Conditions of the lens, which Optimise meets exactly, and boundaries of its merit function.
+  listHeld(found, refused) {
+    const signature = JSON.stringify(found);
+    if (signature === this.heldSignature && !refused) return;
+    this.heldSignature = signature;
+    const send = (parts) => this.event({ type: "condition", ...parts });
+    const rows = found.map((one, number) => {
+      const value = make("span", { className: one.met ? "" : "missed", "data-condition-value": one.words, textContent: one.on ? `${words(one.reached, 6)}${one.met ? "" : ", not met"}` : "off" });
+      if (one.row) return make("div", { className: "row" }, make("span", { className: "grey", textContent: one.words }), value);
+      const text = make("input", { type: "text", value: one.words, "aria-label": `condition ${number + 1}`, spellcheck: false, onchange: () => send({ number, words: text.value }) });
+      const on = make("input", { type: "checkbox", checked: one.on, "aria-label": `condition ${number + 1} is met`, title: "met by Optimise", onchange: () => send({ number, on: on.checked }) });
+      const remove = make("button", { type: "button", textContent: "✕", title: `Remove ${one.words}`, "aria-label": `remove condition ${number + 1}`, onclick: () => send({ number, remove: true }) });
+      return make("div", { className: "row" }, on, text, value, remove);
+    });
+    const added = make("input", { type: "text", placeholder: "efl=50  total_track<=80  edge>=1", "aria-label": "new condition", spellcheck: false, onchange: () => added.value.trim() && send({ words: added.value }) });
+    this.held.replaceChildren(make("h2", { textContent: "Conditions" }), ...rows, make("div", { className: "row" }, added));
   }
 
   columnsOf(lens) {

@@ -1,0 +1,147 @@
+"""Edits one after the other, as the words of `raytrace edit`, and what they change."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from raytrace.edit.choice import At, BadEdit, surfaces_at
+from raytrace.edit.scaling import scale
+from raytrace.edit.surfaces import bend, delete, insert, join, rename, split
+from raytrace.edit.turning import reverse
+from raytrace.maths.numerics import value
+from raytrace.maths.result import Column, Result, Table, number
+from raytrace.system.lens import Lens
+from raytrace.tracing.paraxial import first_order
+from raytrace.words import option
+
+#: An edit by its name, and its words.
+Step = tuple[str, Any]
+
+
+@value
+class Edited(Result):
+    """A lens after edits, with the lens before them."""
+
+    before: Lens
+    lens: Lens
+
+    def figures(self, lens: Lens) -> dict[str, float]:
+        """Effective focal length and track from surface 1 to the image in mm, F/#, count of surfaces, and stop."""
+        data, z, places = first_order(lens), 0.0, [0.0]
+        for surface in lens.surfaces[1:-1]:
+            z += float(surface.thickness)
+            places.append(z)
+        return {
+            "effective_focal_length": float(data.effective_focal_length),
+            "total_track": max(places) - min(places),
+            "f_number": float(data.f_number),
+            "surfaces": len(lens.surfaces),
+            "stop": lens.stop,
+        }
+
+    def document(self) -> dict:
+        before, after = self.figures(self.before), self.figures(self.lens)
+        return {name: {"before": number(before[name]), "after": number(after[name])} for name in before}
+
+    def tables(self) -> list[Table]:
+        before, after = self.figures(self.before), self.figures(self.lens)
+        quantities = ["effective focal length, mm", "total track, mm", "F/#", "surfaces", "stop"]
+        columns: dict[Any, Sequence] = {
+            Column("quantity", form="<", heading=" "): quantities,
+            Column("before", form=".9g"): [*before.values()],
+            Column("after", form=".9g"): [*after.values()],
+        }
+        return [Table(columns)]
+
+
+def edited(lens: Lens, steps: Sequence[Step]) -> Edited:
+    """The lens after edits in their order; surfaces are numbered as the edits before have left them.
+
+    A step "at" chooses the surfaces of the steps behind it that name none. Raises BadEdit.
+    """
+    now, chosen = lens, ""
+    for name, words in steps:
+        if name == "at":
+            surfaces_at(now, words)
+            chosen = words
+        else:
+            now = STEPS[name](now, words, chosen)
+    return Edited(lens, now)
+
+
+def _chosen(words: Sequence[str], chosen: str, name: str, further: int = 0) -> tuple[str, list[str], dict[str, Any]]:
+    """The surfaces of a step, its further words, and its settings NAME=VALUE. Raises BadEdit."""
+    settings = dict(word.split("=", 1) for word in words if "=" in word)
+    plain = [word for word in words if "=" not in word]
+    surfaces = plain.pop(0) if len(plain) > further else chosen
+    if not surfaces:
+        raise BadEdit(f"{option(name)}: no surfaces; give numbers as 3-4, a comment, or {option('at')} before it")
+    if len(plain) != further:
+        raise BadEdit(f"{option(name)} {' '.join(words)}: {len(plain)} values behind the surfaces, expected {further}")
+    return surfaces, plain, {key: _value(text) for key, text in settings.items()}
+
+
+def _value(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _known(settings: Mapping[str, Any], known: Sequence[str], name: str) -> dict[str, Any]:
+    """The settings of a step. Raises BadEdit for an unknown one."""
+    for key in settings:
+        if key not in known:
+            raise BadEdit(f"{option(name)}: no setting {key!r}; expected some of {', '.join(known)}")
+    return dict(settings)
+
+
+def _insert(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    rows = [word for word in words if "=" in word]
+    surfaces, _, _ = _chosen([word for word in words if "=" not in word], chosen, "insert")
+    made = [{key: _value(text) for key, _, text in (cell.partition("=") for cell in row.split(","))} for row in rows]
+    made = [{"thickness": 0.0, **row} for row in made]
+    return insert(lens, surfaces, made) if made else insert(lens, surfaces)
+
+
+def _reverse(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    return reverse(lens, _chosen(words, chosen, "reverse")[0] if words or chosen else None)
+
+
+def _split(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, _, settings = _chosen(words, chosen, "split")
+    return split(lens, surfaces, **_known(settings, ("share", "gap", "curvature"), "split"))
+
+
+def _bend(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, (shape,), settings = _chosen(words, chosen, "bend", 1)
+    factor = _value(shape)
+    if isinstance(factor, str):
+        raise BadEdit(f"{option('bend')} {shape!r}: expected a shape factor, as 0.5")
+    return bend(lens, surfaces, factor, **_known(settings, ("keep",), "bend"))
+
+
+def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, text = (chosen, words[0]) if len(words) == 1 and chosen else (words[0], " ".join(words[1:]))
+    return rename(lens, comments={surfaces: text})
+
+
+def _of_surfaces(edit: Callable[[Lens, At], Lens], name: str) -> Callable[[Lens, Sequence[str], str], Lens]:
+    return lambda lens, words, chosen: edit(lens, _chosen(words, chosen, name)[0])
+
+
+#: The edits by the names of their options: lens, words, surfaces of "at" -> lens.
+STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
+    "scale": lambda lens, factor, chosen: scale(lens, factor),
+    "efl": lambda lens, efl, chosen: scale(lens, efl=efl),
+    "reverse": lambda lens, words, chosen: reverse(
+        lens, _chosen(words, chosen, "reverse")[0] if words or chosen else None
+    ),
+    "swap_conjugates": lambda lens, words, chosen: reverse(lens, swap_conjugates=True),
+    "insert": _insert,
+    "delete": _of_surfaces(delete, "delete"),
+    "join": _of_surfaces(join, "join"),
+    "split": _split,
+    "bend": _bend,
+    "rename": lambda lens, title, chosen: rename(lens, title),
+    "comment": _comment,
+}

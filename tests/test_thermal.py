@@ -1,0 +1,155 @@
+"""A lens over temperature: the analysis, temperatures as configurations, and optimisation over them."""
+
+import dataclasses
+import json
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace.maths.numerics import Dual
+from raytrace.optimization.variables import design_variables
+
+
+def air_spaced(**last):
+    """An air-spaced achromat with an aspheric front."""
+    rows = [
+        dict(radius=60.0, thickness=6.0, glass="N-BK7", coefficients=[0.0, -1e-7]),
+        dict(radius=-50.0, thickness=4.0),
+        dict(radius=-45.0, thickness=2.0, glass="F2"),
+        dict(radius=-150.0, thickness=94.0, **last),
+    ]
+    colours = dict(wavelengths=[0.5876, 0.4861, 0.6563], catalogs=["SCHOTT"])
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=12.0, fields=[0, 2], **colours)
+
+
+def simple():
+    """It on its axis, in one colour."""
+    return air_spaced().at(fields=[0], wavelengths=[0.5876])
+
+
+@pytest.fixture(scope="module")
+def shown():
+    return rt.thermal(simple(), [-20, 60], samples=3, modulation_frequency=20)
+
+
+def test_the_analysis_has_the_numbers_of_the_lens_at_each_temperature(shown):
+    for k, celsius in enumerate((-20.0, 20.0, 60.0)):
+        lens = simple().at(temperature=celsius, mount="aluminium")
+        focused = rt.focus(lens)
+        assert shown.effective_focal_length[k] == rt.first_order(lens).effective_focal_length
+        assert shown.sensor_distance[k] == lens.surfaces[-2].thickness
+        assert shown.rms[1, k].item() == pytest.approx(focused.rms_radius().item(), rel=1e-9)
+        assert shown.rms[0, k].item() == pytest.approx(focused.rms_radius(lens.surfaces[-2].thickness).item(), rel=1e-9)
+    curve = rt.mtf(lens, [20])
+    lowest = torch.minimum(curve.tangential, curve.sagittal).min().item()
+    assert shown.modulation[0, 2].item() == pytest.approx(lowest, abs=1e-12)
+    assert shown.focus_shift[1].item() == pytest.approx(0.0, abs=1e-12)
+    assert bool((shown.rms[0] >= shown.rms[1]).all())
+    assert shown.depth_of_focus.item() == pytest.approx(0.5e-3 * 0.5876 / 0.06**2, rel=0.02)
+
+
+def test_the_analysis_is_a_table_a_figure_and_a_document(shown, tmp_path):
+    document = shown.document()
+    assert document["mount_expansion"] == 23.6
+    assert [row["temperature"] for row in document["results"]] == [-20.0, 20.0, 60.0]
+    assert "focus shift" in str(shown)
+    shown.plot(tmp_path / "thermal.png")
+    shown.save(tmp_path / "thermal.csv")
+    assert (tmp_path / "thermal.csv").read_text().startswith("temperature,effective_focal_length")
+
+
+def test_the_command_prints_the_analysis(command):
+    code, out, err = command(
+        *("thermal", "cemented_achromat", "--range", -10, 40, "--mount", "titanium", "--samples", 2, "--json"),
+        *("--modulation-frequency", 20, "--field", 0, "--wavelength", 0.5876),
+    )
+    assert code == 0, err
+    document = json.loads(out)
+    assert (document["mount_expansion"], document["frequency"]) == (8.6, 20.0)
+
+
+def test_a_range_and_a_mount_that_are_none_are_refused():
+    with pytest.raises(ValueError, match=r"`temperatures` \[60, -20\]: expected the lowest and the highest"):
+        rt.thermal(simple(), [60, -20])
+    with pytest.raises(ValueError, match="mount 'wood'"):
+        rt.thermal(simple(), mount="wood")
+
+
+# -- temperatures as configurations -----------------------------------------------------------------------------------
+
+
+def warm():
+    return air_spaced().with_temperatures([-20, 60], mount="aluminium")
+
+
+def numbers(lens):
+    return [(s.thickness.item(), 0.0 if s.curvature is None else s.curvature.item()) for s in lens.surfaces[1:]]
+
+
+def test_configurations_are_the_lens_at_each_temperature():
+    lens = warm()
+    assert [each.environment.temperature.item() for each in lens.configurations] == [20.0, -20.0, 60.0]
+    start = dataclasses.replace(lens.configuration(1), operands=())
+    for number, celsius in ((2, -20), (3, 60)):
+        assert numbers(lens.configuration(number)) == numbers(start.at(temperature=celsius))
+    with pytest.raises(ValueError, match="a lens of 3 configurations; expected one"):
+        lens.with_temperatures([0])
+    with pytest.raises(ValueError, match=r"surface 1 is none: .* conics and even aspheres"):
+        air_spaced().replace(1, tilt_x=1.0).with_temperatures([0])
+
+
+def test_variables_of_the_lens_move_all_temperatures():
+    """By the optimiser's numbers, by tensors and by `Lens.at`; their derivatives against differences."""
+    model = design_variables(warm(), "curvature thickness sensor a4:1")
+    assert {variable.configuration for variable in model.variables} == {1}
+    x = model.start + np.array([1e-4 if v.quantity == "curvature" else 0.3 for v in model.variables])
+    x[[v.quantity == "a4" for v in model.variables]] = 2e-7
+    moved = model.lens_at(x)
+    start = dataclasses.replace(moved.configuration(1), operands=())
+    for number, celsius in ((2, -20), (3, 60)):
+        state, hot = model.views[number - 1].state(Dual(x, np.eye(len(x)))), moved.configuration(number)
+        expected = numbers(start.at(temperature=celsius))
+        assert numbers(hot) == pytest.approx(np.array(expected), rel=1e-14)
+        for k in range(1, 5):
+            assert float(state.thickness[k].value) == pytest.approx(expected[k - 1][0], rel=1e-14)
+        gap = state.thickness[2]
+        for j, variable in enumerate(model.variables):
+            step = 1e-4 if variable.quantity != "curvature" else 1e-6
+            ends = [model.views[number - 1].state(x + side * step * np.eye(len(x))[j]) for side in (1, -1)]
+            slope = (float(ends[0].thickness[2]) - float(ends[1].thickness[2])) / (2 * step)
+            assert gap.slope[j] == pytest.approx(slope, rel=1e-5, abs=1e-7)
+
+
+def test_a_file_of_thermal_pickups_is_followed(tmp_path):
+    rt.write_lens(warm(), tmp_path / "warm.zmx")
+    again = rt.read_lens(tmp_path / "warm.zmx")
+    assert "kept" not in str(again.optimization_data)
+    assert {solve.kind for solve in again.optimization_data.solves} == {"thermal"}
+    for one, other in zip(again.configurations, warm().configurations, strict=True):
+        assert numbers(one) == pytest.approx(np.array(numbers(other)), rel=1e-12)
+    assert len(design_variables(again, "curvature").variables) == 4
+
+
+def test_another_glass_expands_by_its_own_coefficients():
+    lens = warm()
+    lens = dataclasses.replace(lens.replace(1, glass="N-LAK34"))
+    model = design_variables(lens, "thickness:2")
+    hot = model.lens.configuration(3)
+    assert hot.surfaces[1].thickness.item() == pytest.approx(6.0 * (1 + 40e-6 * 5.81), rel=1e-12)
+
+
+def test_optimisation_over_temperatures_lowers_the_spots_of_all():
+    lens = warm()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = rt.optimize(lens, vary="curvature:1 sensor", merit="spot", cycles=4)
+    before, after = (
+        [rt.spot(each, fields=[0]).whole.rms_radius.item() for each in each_of.configurations]
+        for each_of in (lens, found.lens)
+    )
+    assert max(after) < 0.8 * max(before)
+    start = dataclasses.replace(found.lens.configuration(1), operands=())
+    assert numbers(found.lens.configuration(3)) == pytest.approx(np.array(numbers(start.at(temperature=60))), rel=1e-12)
