@@ -139,12 +139,15 @@ PUBLIC = {
     "ray_fan": "analysis.fans",
     "relative_illumination": "analysis.illumination",
     "rms_over_field": "analysis.rms",
+    "sag": "analysis.sag_table",
     "thermal": "analysis.thermal",
     "seidel": "analysis.seidel",
     "wavefront": "analysis.wavefronts",
     "grid": "maths.sampling",
     "psf": "psf_models",
     "view": "viewer.widget",
+    # drawings and solids
+    "draw": "workshop.sheets",
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
@@ -197,6 +200,7 @@ ERRORS = {
     "ArrayError": "maths.arrays",
     "BadCheckpoint": "optimization.checkpoint",
     "BadEdit": "edit.choice",
+    "BadIndication": "workshop.indications",
     "BadHold": "optimization.variables",
     "BadLimits": "system.parameter_paths",
     "BadMerit": "optimization.merit",
@@ -245,6 +249,7 @@ ERRORS = {
     "NoOptimum": "optimization.least_squares",
     "NoPictures": "imaging.pictures",
     "NoProblem": "optimization.problem",
+    "NoSolid": "workshop.parts",
     "NoStep": "optimization.least_squares",
     "NoThermalCoefficients": "materials.environment",
     "NotConverged": "psf_models.models",
@@ -284,11 +289,12 @@ ERRORS = {
 #: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All
 #: others are names of their packages, `rt.imaging.blur`.
 TOP = (
-    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "view", "glass", "to"),
+    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "view", "glass", "to"),
     *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
-    *("rms_over_field", "thermal", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance", "tolerances"),
+    *("rms_over_field", "sag", "thermal", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance"),
+    "tolerances",
     *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
 )
 #: Packages whose public names are typed with them.
