@@ -543,6 +543,21 @@ class Lens:
         lens = dataclasses.replace(lens, surfaces=surfaces)
         return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
 
+    def with_semi_diameters(
+        self, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
+    ) -> "Lens":
+        """The lens with its clear semi-diameters stored, as a file holds them; automatic ones go on following the rays.
+
+        fixed: the surfaces whose semi-diameters no longer follow the rays; all others do, () frees all; None: as they
+        are. margin: per cent and mm added to automatic ones, but for the stop and the image; None: as it is. Semi-
+        diameters never clip rays. A stored automatic one that differs by less than 1e-6 of it keeps its digits; those
+        that a rule, an operand or a floating stop gives, and radii of normalisation, stay. A batch of lenses stores
+        none. Raises ValueError for a surface that the lens does not have, and for a negative margin.
+        """
+        from raytrace.tracing.geometry import with_semi_diameters
+
+        return with_semi_diameters(self, fixed=fixed, margin=margin)
+
     def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
