@@ -171,7 +171,8 @@ def with_semi_diameters(
             rules.append(Solve(k, _SIZE, "maximum"))
     if fixed is None and all(new is old for new, old in zip(surfaces, lens.surfaces, strict=True)):
         return lens
-    data = dataclasses.replace(data, kept=(*data.kept, *rules), semi_diameters=tuple(fixed or data.semi_diameters))
+    kept = tuple(sorted((*data.kept, *rules), key=lambda rule: rule.surface))
+    data = dataclasses.replace(data, kept=kept, semi_diameters=tuple(sorted(fixed or data.semi_diameters)))
     return dataclasses.replace(lens, surfaces=tuple(surfaces), optimization_data=data)
 
 
