@@ -564,7 +564,8 @@ class Lens:
         surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
         x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
-        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. Raises
+        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. A semi_diameter
+        that is given is fixed; None lets it follow the rays. Raises
         ValueError for fields that a surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
@@ -575,6 +576,10 @@ class Lens:
             numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
         surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
         lens = dataclasses.replace(self, surfaces=tuple(surfaces))
+        if "semi_diameter" in numbers and (data := lens.optimization_data) is not None:
+            others = (k for k in data.semi_diameters if k != surface)
+            fixed = tuple(sorted((*others, surface) if surfaces[surface].semi_diameter else others))
+            lens = dataclasses.replace(lens, optimization_data=dataclasses.replace(data, semi_diameters=fixed))
         _check_object(lens)
         return multiple.kept(lens) if self.operands else lens
 

@@ -133,7 +133,7 @@ def _is_of_all_configurations(lens: Lens, k: int) -> bool:
     """Whether an automatic semi-diameter is the largest of all configurations: by its rule, or as none is stored."""
     data = lens.optimization_data
     rules = () if data is None else data.kept
-    is_maximum = any(rule.address == (k, _SIZE) and rule.kind == "maximum" for rule in rules)
+    is_maximum = any(rule.surface == k and rule.is_largest_size for rule in rules)
     return is_maximum or not lens.surfaces[k].semi_diameter
 
 
@@ -158,7 +158,7 @@ def with_semi_diameters(
     set_by_others = {
         scaled.path[1] for operand in lens.operands for scaled in operand.paths if scaled.path[-1] == _SIZE
     }
-    set_by_others |= {rule.surface for rule in data.kept if rule.quantity == _SIZE and rule.kind != "maximum"}
+    set_by_others |= {rule.surface for rule in data.kept if rule.quantity == _SIZE and not rule.is_largest_size}
     set_by_others |= {lens.stop} if lens.aperture.kind == "float_by_stop" else set()
     surfaces, rules = list(lens.surfaces), []
     for k, size in enumerate(semi_diameters(lens)):
