@@ -15,6 +15,9 @@ from raytrace import system as system
 from raytrace import tolerancing as tolerancing
 from raytrace import tracing as tracing
 from raytrace import wave_optics as wave_optics
+from raytrace.agents.folder import RefusedFile as RefusedFile
+from raytrace.agents.server import NoFolder as NoFolder
+from raytrace.agents.tools import BadParameter as BadParameter
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
@@ -33,6 +36,7 @@ from raytrace.analysis.layout import layout as layout
 from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.rms import rms_over_field as rms_over_field
+from raytrace.analysis.sag_table import sag as sag
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.setting import Incomplete as Incomplete
 from raytrace.analysis.setting import NothingToShow as NothingToShow
@@ -148,6 +152,9 @@ from raytrace.wave_optics.plan import AliasedSampling as AliasedSampling
 from raytrace.words import MissingExtra as MissingExtra
 from raytrace.words import RaytraceError as RaytraceError
 from raytrace.words import RaytraceWarning as RaytraceWarning
+from raytrace.workshop.indications import BadIndication as BadIndication
+from raytrace.workshop.parts import NoSolid as NoSolid
+from raytrace.workshop.sheets import draw as draw
 
 __version__: str
 PUBLIC: dict[str, str]

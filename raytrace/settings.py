@@ -38,6 +38,8 @@ def read(kind: type[T], document: Mapping) -> T:
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
 #: Grades of tolerances, as of `tolerancing.grades`.
 GRADES = ("commercial", "precision", "high")
+#: Suffixes of drawings: sheets, profiles, solids, and the table of parts.
+DRAWINGS = (".pdf", ".svg", ".png", ".dxf", ".step", ".stp", ".csv", ".json")
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"
 

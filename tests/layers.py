@@ -34,6 +34,7 @@ FLOORS = {
     "optimization": 8,
     "tolerancing": 9,
     "imaging": 10,
+    "workshop": 10,
     "viewer": 11,
     "cli": 13,
     # the server of agents, and measurements: nothing imports them

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -265,7 +266,7 @@ def test_examples_of_the_help_parse():
     parser = build_parser()
     for command in commands.COMMANDS:
         for line in re.findall("^  raytrace .*", command.examples, re.M):
-            words = line.split("|")[0].split()
+            words = shlex.split(line.split("|")[0])
             assert parser.parse_args(words[1:]).command == command.name
 
 

@@ -41,6 +41,7 @@ from raytrace.words import did_you_mean, in_command, option, with_options
 DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
+    "--step": "codesign chooses the unit of its variables, sag takes a length",
     "--start": "compare chooses from two places, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
     "--configuration": "layout draws all of them in one figure",
@@ -88,7 +89,8 @@ def test_data_pixels_and_figures_have_their_own_options(name):
     if "-o" in known:
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
-        wrong, said = ("x.pdf", "ends in .png") if name == "render" else ("x.png", "is a picture: figures are saved by")
+        others = {"render": ("x.pdf", "ends in .png"), "draw": ("x.zmx", "is no drawing")}
+        wrong, said = others.get(name, ("x.png", "is a picture: figures are saved by"))
         with pytest.raises(argparse.ArgumentTypeError, match=said):
             known["-o"].type(wrong)
     if "--size" in known and known["--size"].help != argparse.SUPPRESS:

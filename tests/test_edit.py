@@ -7,7 +7,7 @@ import warnings
 
 import pytest
 import torch
-from problems import SHARED, scalar
+from problems import SHARED, scalar, vector
 from torch.testing import assert_close
 
 import raytrace as rt
@@ -38,10 +38,6 @@ from raytrace.tolerancing.files import tolerances_of
 from raytrace.tracing.trace import rays_at
 
 SHIPPED = ["double_gauss", "phone", "hybrid_achromat", "cylinder_pair", "folded_relay", "spectrometer", "hubble"]
-
-
-def vector(*numbers: float) -> torch.Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def quietly(function, *arguments, **options):

@@ -92,7 +92,11 @@ def test_real_files_round_trip_bit_identically(path, tmp_path):
         refused = [LensFileError] if suffix == ".seq" else []  # where CODE V has no command for it
         with contextlib.suppress(*refused):
             write_lens(lens, tmp_path / f"lens{suffix}")
-            assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens if suffix == ".zmx" else one)
+            again = read_lens(tmp_path / f"lens{suffix}")
+            if suffix == ".zmx":
+                assert leaves(again) == leaves(lens)
+            else:
+                assert leaves(without_intent(again)) == leaves(one)
 
 
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)

@@ -35,6 +35,8 @@ DEFERRED = (
     "mcp_types",
     "anyio",
     "colour",
+    "ezdxf",
+    "OCP",
 )
 
 #: Modules that alone may import a library at their top.
@@ -188,15 +190,16 @@ DISTRIBUTIONS = {
     "mcp_types": "mcp",
     "anyio": "mcp",
     "PIL": "pillow",
+    "OCP": "cadquery-ocp-novtk",
     "colour": "colour-science",
     "mpl_toolkits": "matplotlib",
 }
 
 
 def test_every_package_that_is_imported_is_declared():
-    """Viewer, measured cameras and the server of agents have extras."""
+    """Viewer, measured cameras, DXF and STEP files, and the server of agents have extras."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [name for extra in ("view", "colour", "mcp") for name in project["optional-dependencies"][extra]]
+    extras = [name for extra in ("view", "colour", "cad", "mcp") for name in project["optional-dependencies"][extra]]
     declared = {re.match(r"[\w-]+", name)[0] for name in (*project["dependencies"], *extras)}
     library = MODULES.values()
     roots = {name.split(".")[0] for path in library for name in imports(path)}

@@ -351,8 +351,12 @@ def assert_alike(one, other) -> None:
         assert one == (pytest.approx(other, rel=1e-9, abs=1e-9) if isinstance(other, float) else other)
 
 
-#: Options that a command needs for a lens that has no tolerances or variables of its own.
-NEEDED = {"jacobian": {"vary": "curvature:1"}, "tolerance": {"limits": "radius=0.1%", "trials": 20}}
+#: Options that a command needs for a lens that has no tolerances or variables of its own, and arguments.
+NEEDED = {
+    "jacobian": {"vary": "curvature:1"},
+    "sag": {"surface": 3},
+    "tolerance": {"limits": "radius=0.1%", "trials": 20},
+}
 
 
 @pytest.mark.parametrize(
@@ -362,7 +366,8 @@ NEEDED = {"jacobian": {"vary": "curvature:1"}, "tolerance": {"limits": "radius=0
 def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
     """As JSON by the function itself; as text the result already computed."""
     needed = NEEDED.get(command.name, {})
-    words = [word for name, given in needed.items() for word in (f"--{name}", str(given))]
+    words = [str(given) for name, given in needed.items() if name == "surface"]
+    words += [word for name, given in needed.items() if name != "surface" for word in (f"--{name}", str(given))]
     assert main([command.name, "cooke_triplet", "--json", *words]) == 0
     printed = capsys.readouterr().out
     found = rt.public_name(command.verb)(rt.read_lens("cooke_triplet"), **needed)

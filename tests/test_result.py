@@ -52,6 +52,7 @@ def results() -> dict[str, tuple]:
         "slanted edge": (lambda: rt.imaging.slanted_edge_mtf(edge, 0.004), "frequency mtf"),
         "rms of wavefronts": (lambda: rt.rms_over_field(double, samples=3), "rms"),
         "rms of spots": (lambda: rt.rms_over_field(double, samples=3, spot=True), "rms_um"),
+        "sag": (lambda: rt.sag("phone", 3, step=0.2), "radius sag slope vertex_departure_um best_fit_departure_um"),
         "seidel": (lambda: rt.seidel(double), "S1 S2 S3 S4 S5 marginal_yni chief_yni"),
         "seidel in waves": (lambda: rt.seidel(double, kind="waves"), "W040 W131"),
         "wavefront": (lambda: rt.wavefront(double, size=16, terms=9, **fields), "coefficient"),
@@ -81,6 +82,10 @@ def results() -> dict[str, tuple]:
         "first_order": (lambda: rt.first_order(double), "power effective_focal_length optical_invariant"),
         "info": (lambda: rt.info(double), "radius thickness semi_diameter index"),
         "trace": (lambda: rt.trace(double), "x y z opl"),
+        "thermal": (
+            lambda: rt.thermal(single, samples=2),
+            "temperature effective_focal_length focus_shift_um rms_fixed_um modulation_fixed",
+        ),
         "glass": (lambda: rt.glass("N-BK7", temperature=40), "wavelength index dn_dt dn_dt_absolute"),
     }
 

@@ -142,7 +142,7 @@ def server(folder: Path) -> "Server":
         try:
             tool_of(params.name)
         except BadParameter as error:
-            answer = {"text": str(error), "is_error": True}
+            answer: dict[str, Any] = {"text": str(error), "is_error": True}
         else:
             request = {"tool": params.name, "arguments": params.arguments or {}}
             answer = await context.lifespan_context.call(request, context.session.report_progress)

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from raytrace.cli import types
 from raytrace.cli.commands import COMMANDS, Command
 from raytrace.cli.options import OPTIONS, add
-from raytrace.cli.types import OutputFile, OutputFolder, Reader
+from raytrace.cli.types import OutputFile, OutputFolder
 from raytrace.words import RaytraceError, did_you_mean, known_option
 
 #: Given to the agent at the start.
 INSTRUCTIONS = (
-    "A sequential, differentiable ray tracer for lens design. Lenses are named by the name of a shipped lens "
-    "(`lenses` lists them) or by the path of a lens file relative to the folder of this server. Lengths are mm, "
-    "wavelengths µm, angles degrees, unless stated otherwise; surfaces count from 1. `json` gives all figures in full "
-    "precision, `plot` gives the figure."
+    "A sequential, differentiable ray tracer for lens design. Lenses are named by the name of a shipped lens (the tool "
+    "lenses lists them) or by the path of a lens file relative to the folder of this server. Lengths are mm, "
+    "wavelengths µm, angles degrees, unless stated otherwise; surfaces count from 1. The parameter json gives all "
+    "figures in full precision, plot the picture."
 )
 
 
@@ -176,7 +176,7 @@ _ABOVE_0 = {"type": "number", "exclusiveMinimum": 0}
 _PAIR = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
 
 #: JSON schemas by reader; values of the others are strings.
-_SCHEMAS: dict[Reader | None, dict] = {
+_SCHEMAS: dict[object, dict] = {
     types.count: _COUNT,
     types.many: _COUNT,
     types.count_or_none: _FROM_0,
@@ -238,7 +238,8 @@ def _single(action: argparse.Action, value: object) -> object:
     if not parts or any(isinstance(part, bool) or not isinstance(part, (str, int, float)) for part in parts):
         raise BadParameter(f"`{action.dest}` is {value!r}; expected a number or a text")
     try:
-        entry = (action.type or str)(",".join(map(str, parts)))
+        text = ",".join(map(str, parts))
+        entry = action.type(text) if callable(action.type) else text
     except (argparse.ArgumentTypeError, ValueError) as error:
         raise BadParameter(f"`{action.dest}`: {error}") from error
     if action.choices is not None and entry not in action.choices:

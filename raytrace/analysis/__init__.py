@@ -16,6 +16,7 @@
 | thermal                                     | focus, spot and MTF over temperature                           |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
+| sag                                         | sag, slope, aspheric departure, best-fit sphere of a surface   |
 | compare, abilities                          | PSF models, and the properties that each can represent         |
 
 `result` has what their results share (a lens, fields, a summary), `setting` their fields and wavelengths, `panels`

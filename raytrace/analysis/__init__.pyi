@@ -14,6 +14,7 @@ from raytrace.analysis.layout import layout as layout
 from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.rms import rms_over_field as rms_over_field
+from raytrace.analysis.sag_table import sag as sag
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.thermal import thermal as thermal

@@ -5,6 +5,7 @@ draws.
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -204,11 +205,10 @@ def element(
     y = heights(*radii)
     forward = math.copysign(1.0, z_back - z_front)
     outlines = []
-    for along_sag in (cemented, (True, True), (False, True), (True, False), (False, False)):
+    for ends in continuations((front, back), radii, rim, cemented):
         z = []
-        for surface, vertex, radius, continued in zip((front, back), (z_front, z_back), radii, along_sag, strict=True):
-            reach = min(rim, edge_radius(surface)) if continued else radius
-            z.append(vertex + depth(surface, np.clip(y, -reach, reach), direction))
+        for surface, vertex, end in zip((front, back), (z_front, z_back), ends, strict=True):
+            z.append(vertex + depth(surface, np.clip(y, -end, end), direction))
         gap = forward * (z[1] - z[0])
         if (gap >= 0).all():
             break
@@ -218,6 +218,21 @@ def element(
         kept = np.abs(y) < limit
         y, z = y[kept], [side[kept] for side in z]
     return np.concatenate([z[0], z[1][::-1]]), np.concatenate([y, y[::-1]])
+
+
+def continuations(
+    faces: tuple[Surface, Surface], radii: Sequence[float], rim: float, continued: tuple[bool, bool]
+) -> Iterator[tuple[float, float]]:
+    """Radii in mm up to which two faces of glass follow their sag, flat from there to the rim, in order of preference.
+
+    radii: mm of each face, up to which it always does; continued: whether it does up to the rim, at first.
+    """
+    for along_sag in (continued, (True, True), (False, True), (True, False), (False, False)):
+        front, back = (
+            min(rim, edge_radius(surface)) if further else radius
+            for surface, radius, further in zip(faces, radii, along_sag, strict=True)
+        )
+        yield front, back
 
 
 def ray_paths(

@@ -42,6 +42,7 @@ from raytrace.cli.types import (
     count_or_none,
     criterion_value,
     data_file,
+    drawing_file,
     extent,
     file_name,
     file_of,
@@ -292,6 +293,41 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         Option("view", help="yz (from the side), xz (from above) or 3d (in space)", choices=("yz", "xz", "3d"),
             default="yz"),
         run="cli.runs:layout",
+    ),
+    _command(
+        "draw",
+        "drawings to ISO 10110, and solids, for the workshop",
+        "Draw the whole lens with its parts, vertex distances and tolerances, and with --elements a sheet to ISO 10110 "
+        "for each element and each cemented group: profile to scale, diameters, radii, thickness, chamfers, the "
+        "indications 0/ to 6/, equation and sag table of aspheres. .pdf has a page a sheet, .svg and .png a file a "
+        "sheet. .dxf has the profiles and .step the solids of the same parts at 1:1; both need the extra: pip install "
+        "'raytrace[cad]'. The text lists the parts.",
+        """
+        double_gauss --elements --grade precision -o drawings.pdf
+        cooke_triplet --elements 2 --margin 1 --chamfer 0.3 --indications 5/5x0.25 0/20 -o element.svg
+        lens.zmx -o lens.step
+        hubble --substrate 300 -o mirrors.step
+        phone --elements 1 -o element.dxf""",
+        *LENS, CONDITIONS,
+        output("drawings (.pdf, .svg, .png), profiles (.dxf), solids (.step), or the table of parts (.csv, .json)",
+            drawing_file),
+        Option("elements", count, "N", "a sheet for each element and cemented group, or for these alone, from 1 in the "
+            "order of the light; files of CAD have these parts", nargs="*"),
+        group(
+            "requirements",
+            row("grade", "tolerances of a published grade instead of the file's"),
+            row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            Option("indications", None, "N/VALUE", "further indications of ISO 10110 of all parts: 0/20 1/3x0.16 2/1;1 "
+                "5/5x0.25 6/-; others are dashes", nargs="+", default=""),
+            Option("coating", None, "TEXT", "of all surfaces in air", default=""),
+        ),
+        group(
+            "mechanical sizes",
+            Option("margin", not_negative, "MM", "of the mechanical semi-diameter beyond the clear one", default=0.0),
+            Option("chamfer", not_negative, "MM", "legs of the chamfers at edges in air, at 45°", default=0.0),
+            Option("substrate", positive_finite, "MM", "thickness of mirrors (default: a sixth of their diameter)"),
+        ),
+        Option("date", None, "TEXT", "of the title block; of STEP files as 2026-11-29", default=""),
     ),
     _command(
         "spot",
@@ -823,6 +859,25 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         double_gauss --field 0 14 --surfaces --json""",
         *LENS, CONDITIONS, plot("the curves"), TABLE,
         "fields", "samples", switch("surfaces", "list every surface in the text, not only the sensor"),
+    ),
+    _command(
+        "sag",
+        "sag table of a surface, best-fit sphere, aspheric departure",
+        "Sag and slope of a surface over the radius, and its departure from the vertex sphere and from the best-fit "
+        "sphere, with the radius of that sphere and the largest and RMS departure over the aperture.",
+        """
+        phone 3 --step 0.1
+        double_gauss 1 --best-fit rim --plot sag.png -o sag.csv
+        cylinder_pair 1 --azimuth 0 --json""",
+        "lens", Option("surface", count, "SURFACE", "number of the surface", flag="surface"),
+        *LENS[1:], CONDITIONS, plot("sag, slope and departures"), TABLE,
+        Option("step", positive_finite, "MM", "of the radius (default: a round tenth of the semi-diameter)"),
+        Option("semi_diameter", positive_finite, "MM", "of the aperture (default: the surface's own, or that of the "
+            "rays of all fields)"),
+        Option("best_fit", help="sphere through the vertex by least squares of the sag over the aperture (rms), also "
+            "shifted along z (offset), or through vertex and rim (rim)", choices=("rms", "offset", "rim"),
+            default="rms"),
+        Option("azimuth", finite, "DEGREES", "of the direction, from x, of surfaces that are not round", default=90.0),
     ),
     _command(
         "rms-over-field",

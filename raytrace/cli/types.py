@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import TypeAlias
 
+from raytrace.settings import DRAWINGS
+
 Reader: TypeAlias = Callable[[str], object]
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -59,6 +61,17 @@ def file_of(*suffixes: str) -> Callable[[str], OutputFile]:
         return file
 
     return reader
+
+
+def drawing_file(text: str) -> OutputFile:
+    """A drawing, or solids, to write."""
+    file = output_file(text)
+    file.suffixes = DRAWINGS
+    if PurePath(text).suffix.lower() not in file.suffixes:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no drawing: expected a name that ends in {', '.join(file.suffixes)}"
+        )
+    return file
 
 
 def lens_file(text: str) -> OutputFile:

@@ -385,7 +385,8 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
     several = any(row.operand == "CONF" for row in above) or any(condition.configuration for condition in conditions)
     primaries, count = any(row.operand == "PRIM" for row in above), len(rows)
     for condition in conditions:
-        settings = [Row("PRIM", (0, lens.primary_wavelength))] if primaries else []
+        primary = Row("PRIM", (0, lens.primary_wavelength))
+        settings = [primary] if primaries else []
         settings += [Row("CONF", (condition.configuration or lens.current_configuration, 0))] if several else []
         start = count + len(settings)
         last = dataclasses.replace(condition.row, weight=-1.0)

@@ -262,6 +262,11 @@ def legend_entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
+def text_width(text: str, size: float) -> float:
+    """Points that a line of text of a size in points takes."""
+    return sum(_width(word, size, False) for word in text.split(" ")) + text.count(" ") * _width(" ", size, False)
+
+
 def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
     """A text of a size in points in lines no wider than a figure of a width in inches, by the widths of its letters.
 

@@ -298,15 +298,15 @@ def psf(
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
     wavelengths = like if wavelengths is None else row(wavelengths)
     weights = torch.ones_like(wavelengths) if weights is None else row(weights)
-    D = len(distances)
-    if fields.dim() not in (2, 3) or fields.shape[:-1] != (2, D)[: fields.dim() - 1] or not fields.numel():
-        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F), or (2, {D}, F)")
     for parameter, values in (("object_distances", distances), ("wavelengths", wavelengths)):
         if values.dim() != 1 or not len(values):
             raise ValueError(f"{parameter} of shape {tuple(values.shape)}; expected one axis")
         if bool(values.isnan().any()) or bool((values == 0).any()):
             others = f"expected numbers other than 0 and nan; give others by {option(parameter)}"
             raise ValueError(f"{parameter} {values.tolist()}; {others}")
+    D = len(distances)
+    if fields.dim() not in (2, 3) or fields.shape[:-1] != (2, D)[: fields.dim() - 1] or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F), or (2, {D}, F)")
     if weights.shape != wavelengths.shape:
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):

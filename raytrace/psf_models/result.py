@@ -185,8 +185,9 @@ class Psf(Result):
 
     @property
     def _fields(self) -> Tensor:
-        """Field points (2, ...) that broadcast to the axes of `energy`."""
-        return self.fields if self.wavelengths_summed else self.fields[..., None]
+        """Field points (2, 1 or D, F), or (2, 1 or D, F, 1), that broadcast to the axes of `energy`."""
+        fields = self.fields.reshape(2, -1, self.fields.shape[-1])
+        return fields if self.wavelengths_summed else fields[..., None]
 
     def draw(self, **options: Any) -> Figure:
         """The kernels over object distance and field; options: as for `psf_models.figures.psf_grid`."""

@@ -71,6 +71,11 @@ def conic_sag(u: Number, c: Number, w: Number) -> Number:
     return c * u / (1 + w)
 
 
+def curvature_through(z: Number, h: Number, shape: Number = 1.0) -> Number:
+    """c = 2z/(h² + (1+k) z²) of the conic through the vertex that has a sag z at a radius h; shape: 1+k."""
+    return 2 * z / (h**2 + shape * z * z)
+
+
 def conic_terms(
     u: Tensor, c: Tensor, conic: Tensor | None, highest: int, along: Tensor | float = 1.0
 ) -> tuple[Tensor, Tensor, Tensor]:

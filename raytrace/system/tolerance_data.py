@@ -27,6 +27,7 @@ from raytrace.maths.zernike import fringe, noll, norm
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, with_number
 from raytrace.system.sag_terms import IrregularSag, as_polynomial
+from raytrace.system.shapes import curvature_through
 from raytrace.system.surface import Surface
 
 #: Distributions of an error between its limits, and OpticStudio's number of each.
@@ -196,11 +197,11 @@ def _radius(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) -> Su
 
 
 def _power(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) -> Surface:
-    """c′ = 2z′/(h² + (1+k) z′²), the conic through z′(h) = z(h) + N λ/2."""
+    """The conic through z′(h) = z(h) + N λ/2."""
     c, h = _curvature_of(surface), gauge.radius
     shape = 1.0 if surface.conic is None else 1 + surface.conic
     z = c * h**2 / (1 + torch.sqrt(1 - shape * (c * h) ** 2)) + error * (0.5 * gauge.wavelength)
-    return dataclasses.replace(surface, curvature=2 * z / (h**2 + shape * z * z))
+    return dataclasses.replace(surface, curvature=curvature_through(z, h, shape))
 
 
 def _curvature(surface: Surface, error: Tensor, row: Tolerance, gauge: Gauge) -> Surface:

@@ -125,7 +125,7 @@ def _gauges(
         gauges[k] = Gauge(radius if radius > 0 else None, wavelength, angles.get(k))
     for row, _ in pairs:
         if KINDS[row.kind].needs_semi_diameter and gauges[row.surfaces[0]].semi_diameter is None:
-            message = "the surface has no semi-diameter, and no ray reaches it; give it `semi_diameter`"
+            message = "the surface has no semi-diameter, and no ray reaches it; give the surface one"
             raise BadTolerance(f"{_named(row)}: {message}")
     return gauges
 
