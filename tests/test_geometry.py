@@ -15,10 +15,18 @@ from raytrace.materials.glass import MIRROR, model_glass
 from raytrace.optimization.merit import Evaluation
 from raytrace.optimization.operands.boundaries import AT_RIM
 from raytrace.optimization.variables import DesignVariables
+from raytrace.system.apertures import Aperture
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import Unbuildable, defects, rims, semi_diameters
+from raytrace.tracing.geometry import (
+    Unbuildable,
+    clear_semi_diameters,
+    defects,
+    fixed_semi_diameters,
+    rims,
+    semi_diameters,
+)
 from raytrace.tracing.lens_report import Info
 
 GLASS = model_glass(1.6, 50.0)
@@ -204,3 +212,90 @@ def test_python_warns_too():
     with pytest.warns(Unbuildable, match="negative"):
         rt.info(CASES["gap"][0]())
     assert Info(CASES["reach"][0]()).document()["geometry"][0]["kind"] == "reach"
+
+
+# -- semi-diameters ----------------------------------------------------------------------------------------------------
+
+
+def tilted_beams(thickness=5.0, **options):
+    """A plate of index 1.5 behind the stop on its front face, 5 mm high, and the image 20 mm behind it."""
+    rows = [{"thickness": thickness, "glass": 1.5}, {"thickness": 20.0}]
+    return rt.lens(rows, stop=1, fields=[0, 10], entrance_pupil_diameter=10.0, **options)
+
+
+def heights_behind(thickness):
+    """5 + t tan θ′ on the back of the plate, and 20 tan θ more on the image."""
+    slope = math.tan(math.asin(math.sin(math.radians(10)) / 1.5))
+    return [5.0, 5 + thickness * slope, 5 + thickness * slope + 20 * math.tan(math.radians(10))]
+
+
+def test_automatic_semi_diameters_are_those_of_a_closed_form_with_their_derivative():
+    assert semi_diameters(tilted_beams())[1:] == pytest.approx(heights_behind(5.0), rel=1e-13)
+    thickness = torch.tensor(5.0, dtype=torch.float64, requires_grad=True)
+    sizes = clear_semi_diameters(tilted_beams().replace(1, thickness=thickness), [1, 2, 3])
+    (slope,) = torch.autograd.grad(sizes[2], thickness)
+    above, below = (clear_semi_diameters(tilted_beams(t), [2])[2] for t in (5 + 1e-4, 5 - 1e-4))
+    assert float(slope) == pytest.approx(float(above - below) / 2e-4, rel=1e-8)
+    assert float(slope) == pytest.approx(math.tan(math.asin(math.sin(math.radians(10)) / 1.5)), rel=1e-13)
+
+
+def test_an_automatic_semi_diameter_is_the_largest_of_all_configurations():
+    zoom = tilted_beams().with_configurations(thickness={1: [5.0, 8.0]})
+    assert semi_diameters(zoom)[1:] == pytest.approx(heights_behind(8.0), rel=1e-13)
+    stored = dataclasses.replace(
+        zoom.replace(2, semi_diameter=6.0), optimization_data=OptimizationData()
+    )  # a file's automatic one is of its configuration
+    assert semi_diameters(stored)[2] == pytest.approx(heights_behind(5.0)[1], rel=1e-13)
+
+
+def test_no_aperture_limits_an_automatic_semi_diameter():
+    clipped = tilted_beams().replace(1, apertures=(Aperture("circular", (0.0, 2.0)),))
+    assert semi_diameters(clipped)[1:] == pytest.approx(heights_behind(5.0), rel=1e-13)
+
+
+def test_margins_and_fixed_semi_diameters():
+    lens = tilted_beams().with_semi_diameters(margin=(10.0, 0.5))
+    stop, back, image = heights_behind(5.0)
+    assert semi_diameters(lens)[1:] == pytest.approx([stop, 1.1 * back + 0.5, image], rel=1e-13)
+    assert [s.semi_diameter for s in lens.surfaces[1:]] == semi_diameters(lens)[1:]
+    thick = lens.replace(1, thickness=8.0)
+    assert semi_diameters(thick)[2] == pytest.approx(1.1 * heights_behind(8.0)[1] + 0.5, rel=1e-13)
+    assert semi_diameters(lens.with_semi_diameters(fixed=[2]).replace(1, thickness=8.0))[2] == semi_diameters(lens)[2]
+    assert semi_diameters(lens.with_semi_diameters(fixed=[2]).with_semi_diameters(fixed=())) == pytest.approx(
+        semi_diameters(lens), nan_ok=True
+    )
+    with pytest.raises(ValueError, match="fixed semi-diameters of surfaces"):
+        lens.with_semi_diameters(fixed=[9])
+    with pytest.raises(ValueError, match="per cent and mm"):
+        lens.with_semi_diameters(margin=(-1.0, 0.0))
+
+
+@pytest.mark.parametrize("name", ["plate.zmx", "plate.csv", "plate.seq"])
+def test_files_hold_automatic_and_fixed_semi_diameters(name, tmp_path):
+    lens = tilted_beams().replace(2, semi_diameter=7.0)
+    for design in (lens, lens.with_semi_diameters(margin=(10.0, 0.5)), lens.with_semi_diameters(fixed=[])):
+        rt.write_lens(design, tmp_path / name)
+        again = rt.read_lens(tmp_path / name)
+        assert semi_diameters(again) == pytest.approx(semi_diameters(design), rel=1e-14, nan_ok=True)
+        assert fixed_semi_diameters(again) == fixed_semi_diameters(design)
+        thick = [semi_diameters(each.replace(1, thickness=8.0)) for each in (again, design)]
+        assert thick[0] == pytest.approx(thick[1], rel=1e-14, nan_ok=True)
+
+
+def test_a_lens_without_semi_diameters_writes_and_prints_those_of_its_rays(tmp_path):
+    rt.write_lens(tilted_beams(), tmp_path / "plate.zmx")
+    lines = [line.split() for line in (tmp_path / "plate.zmx").read_text().splitlines() if "DIAM" in line]
+    assert [float(words[1]) for words in lines[1:]] == pytest.approx(heights_behind(5.0), rel=1e-13)
+    assert [words[2] for words in lines] == ["0"] * 4
+    document = Info(tilted_beams()).document()["surfaces"]
+    assert [row["semi_diameter"] for row in document[1:]] == pytest.approx(heights_behind(5.0), rel=1e-13)
+    assert f"{heights_behind(5.0)[1]:.5g}" in str(tilted_beams())
+
+
+def test_a_zoom_lens_writes_the_largest_of_all_configurations(tmp_path):
+    zoom = tilted_beams().with_configurations(thickness={1: [5.0, 8.0]})
+    rt.write_lens(zoom, tmp_path / "zoom.zmx")
+    again = rt.read_lens(tmp_path / "zoom.zmx")
+    assert (tmp_path / "zoom.zmx").read_text().count(" 3 0 0 1 ") == 3  # the code of the largest of all
+    assert semi_diameters(again)[1:] == pytest.approx(heights_behind(8.0), rel=1e-13)
+    assert semi_diameters(again.configuration(2)) == pytest.approx(semi_diameters(again), nan_ok=True)

@@ -105,8 +105,7 @@ def test_a_surface_without_semi_diameter_is_drawn_as_far_as_its_rays_reach(doubl
     bare = dataclasses.replace(
         double_gauss, surfaces=tuple(dataclasses.replace(s, semi_diameter=None) for s in double_gauss.surfaces)
     )
-    fields = torch.stack([bare.fields.x, bare.fields.y])
-    radii = cross_section.drawn_radii(bare, bare.wavelengths[0], fields)
+    radii = cross_section.drawn_radii(bare)
     highest = {}
     for path in (path for field in fans(bare, 11) for path in field):
         for height, k in zip(path.y[1:], path.corners[1:], strict=True):

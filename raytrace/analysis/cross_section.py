@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.sampling import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
 from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_posed, sag_at
-from raytrace.tracing.geometry import Frame, edge_radius, frames
+from raytrace.tracing.geometry import Frame, edge_radius, frames, semi_diameters
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps, points_on_surfaces
 
@@ -144,30 +143,16 @@ def heights(*radii: float) -> np.ndarray:
     return np.unique(np.concatenate([np.linspace(-max(radii), max(radii), _POINTS), *([-r, r] for r in radii)]))
 
 
-def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor, stop: float | None = None) -> list[float]:
-    """Radius in mm to which every surface is drawn.
-
-    The semi-diameter of the file, else 4 % more than the rays of all fields reach; wavelength: () or (W,);
-    stop: the radius of the stop, where it is known.
-    """
-    stored = [surface.semi_diameter or 0.0 for surface in lens.surfaces]
-    if min(stored[1:]) <= 0:
-        dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
-        points = torch.cat([fan(11, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
-        wavelengths = wavelength.reshape(-1)
-        rays = launch(lens, points, fields=fields, wavelengths=wavelengths)
-        for k, crossing in enumerate(lens_steps(lens, rays, wavelengths[:, None]), start=1):
-            if stored[k] <= 0:
-                x, y, _ = crossing.rays.position
-                reach = torch.where(crossing.rays.valid, torch.hypot(x, y), 0.0).max()
-                stored[k] = 1.04 * float(reach)
+def drawn_radii(lens: Lens, stop: float | None = None) -> list[float]:
+    """Radius in mm to which every surface is drawn: its clear semi-diameter; stop: that of the stop, if it is known."""
+    radii = [0.0 if math.isnan(size) else size for size in semi_diameters(lens)]
     stop = abs(float(stop_radius(lens)) if stop is None else stop)
     if math.isfinite(stop):
-        stored[lens.stop] = max(stored[lens.stop], stop)
-    largest = max(stored[1:])
+        radii[lens.stop] = max(radii[lens.stop], stop)
+    largest = max(radii[1:])
     return [
         min(radius if radius > 0 else 0.1 * largest, 0.9999 * edge_radius(surface))
-        for surface, radius in zip(lens.surfaces, stored, strict=True)
+        for surface, radius in zip(lens.surfaces, radii, strict=True)
     ]
 
 

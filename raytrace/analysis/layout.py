@@ -254,7 +254,7 @@ def _drawn(
     """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
         stop = float(stop_radius(lens))
-        places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, wavelengths, fields, stop)
+        places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, stop)
         indices = [float(index) for index in media(lens, wavelengths[0])]
         right, up = _extent(lens, places, radii)
         first, last = right

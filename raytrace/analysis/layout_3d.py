@@ -28,7 +28,7 @@ def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> style.Fi
     figure = style.new_figure(7.5, 6.0)
     axes = figure.add_subplot(projection="3d", computed_zorder=False)
     with torch.no_grad():
-        places, radii = frames(lens), cross_section.drawn_radii(lens, wavelengths, fields)
+        places, radii = frames(lens), cross_section.drawn_radii(lens)
         indices = [float(index) for index in media(lens, wavelengths[0])]
         corners = _draw_surfaces(axes, lens, places, radii, indices)
         size = max(np.ptp(corners, axis=1).max(), 1e-9)

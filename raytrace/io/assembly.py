@@ -455,6 +455,36 @@ def with_written_variables(lens: Lens, words: str, place: Place) -> Lens:
     return dataclasses.replace(lens, surfaces=tuple(surfaces), optimization_data=data)
 
 
+def written_automatic(lens: Lens) -> str:
+    """The surfaces whose stored semi-diameters follow the rays, and their margin, as "1 3 4 margin 5.0 0.1"."""
+    if (data := lens.optimization_data) is None:
+        return ""
+    sized = [
+        str(k) for k, surface in enumerate(lens.surfaces) if surface.semi_diameter and k not in data.semi_diameters
+    ]
+    margin = ["margin", *map(repr, data.semi_diameter_margin)] if any(data.semi_diameter_margin) else []
+    return " ".join([*sized, *margin])
+
+
+def with_written_automatic(lens: Lens, words: str, place: Place) -> Lens:
+    """The lens with the automatic semi-diameters of a line of its file, and their margin in per cent and mm."""
+    if not words.strip():
+        return lens
+    numbers, _, margin = words.partition("margin")
+    try:
+        automatic, parts = (
+            {int(number) for number in numbers.split()},
+            [float(part) for part in margin.split()] or [0.0, 0.0],
+        )
+        percent, length = parts
+    except ValueError as error:
+        message = f"automatic: {shown(words)}, expected surfaces and their margin, as 1 3 4 margin 5 0.1"
+        raise LensFileError(message, place) from error
+    sized = (k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter and k not in automatic)
+    data = OptimizationData(semi_diameters=tuple(sized), semi_diameter_margin=(percent, length))
+    return dataclasses.replace(lens, optimization_data=data)
+
+
 def written_conditions(lens: Lens, place: Place) -> str:
     """The conditions of a lens, in words, but for those that take values of other rows of its merit function."""
     try:

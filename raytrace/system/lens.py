@@ -543,13 +543,29 @@ class Lens:
         lens = dataclasses.replace(lens, surfaces=surfaces)
         return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
 
+    def with_semi_diameters(
+        self, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
+    ) -> "Lens":
+        """The lens with its clear semi-diameters stored, as a file holds them; automatic ones go on following the rays.
+
+        fixed: the surfaces whose semi-diameters no longer follow the rays; all others do, () frees all; None: as they
+        are. margin: per cent and mm added to automatic ones, but for the stop and the image; None: as it is. Semi-
+        diameters never clip rays. A stored automatic one that differs by less than 1e-6 of it keeps its digits; those
+        that a rule, an operand or a floating stop gives, and radii of normalisation, stay. A batch of lenses stores
+        none. Raises ValueError for a surface that the lens does not have, and for a negative margin.
+        """
+        from raytrace.tracing.geometry import with_semi_diameters
+
+        return with_semi_diameters(self, fixed=fixed, margin=margin)
+
     def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
 
         surface: its number in the file, 0 the object; numbers: fields of Surface, radius (mm), or numbers of its poses:
         x, y, z (mm), tilt_x, tilt_y, tilt_z (degrees) and tilts_first, behind the surface x_after, …; plain numbers, or
         tensors that may require a gradient; glass: a name, an index, (nd, Vd) or a Glass, as in the rows of `rt.lens`.
-        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. Raises
+        A tilted object has its vertex on the axis of surface 1, and object heights along its own axes. A semi_diameter
+        that is given is fixed; None lets it follow the rays. Raises
         ValueError for fields that a surface does not have, UnknownGlass.
         """
         if not 0 <= surface < len(self.surfaces):
@@ -560,6 +576,10 @@ class Lens:
             numbers = {**numbers, "glass": medium(numbers["glass"], self.catalogs, where)}
         surfaces[surface] = changed(surfaces[surface], numbers, where, like=self.wavelengths)
         lens = dataclasses.replace(self, surfaces=tuple(surfaces))
+        if "semi_diameter" in numbers and (data := lens.optimization_data) is not None:
+            others = (k for k in data.semi_diameters if k != surface)
+            fixed = tuple(sorted((*others, surface) if surfaces[surface].semi_diameter else others))
+            lens = dataclasses.replace(lens, optimization_data=dataclasses.replace(data, semi_diameters=fixed))
         _check_object(lens)
         return multiple.kept(lens) if self.operands else lens
 

@@ -68,8 +68,8 @@ class Solve:
 
     All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):
 
-    "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" (over configurations) of a "semi_diameter";
-        others, named as in the file.
+    "substitute" of a "glass": it may be exchanged; "pickup" of a "semi_diameter"; others, named as in the file.
+    "maximum" of a "semi_diameter": the largest of all configurations, which `tracing.geometry` follows.
 
     configuration, operand: as for `Vary`. A "pickup" of those follows configuration `source`, there operand numbers[0];
         its offset is in `OptimizationData.unit`.
@@ -94,6 +94,11 @@ class Solve:
     def address_of_source(self) -> tuple[int, str]:
         """Of the number that a pickup follows."""
         return self.source, self.quantity_of_source or self.quantity
+
+    @property
+    def is_largest_size(self) -> bool:
+        """Of a semi-diameter that is the largest of all configurations."""
+        return self.quantity == "semi_diameter" and self.kind == "maximum"
 
     def __str__(self) -> str:
         if self.kind == "pickup" and self.operand is None:
@@ -185,7 +190,7 @@ class OptimizationData:
         lines = [
             *(f"varies: {rule}" for rule in self.variables),
             *(f"follows: {rule}" for rule in self.solves),
-            *(f"kept: {rule}" for rule in self.kept),
+            *(f"{'follows' if rule.is_largest_size else 'kept'}: {rule}" for rule in self.kept),
             *([f"merit function of {len(self.merit)} lines: {operands}"] if self.merit else []),
             *([f"tolerances: {len(self.tolerances)} lines"] if self.tolerances else []),
         ]

@@ -23,16 +23,19 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Number, detached, dot_2, safe_sqrt, value
 from raytrace.system.lens import Lens, media, per_lens
+from raytrace.system.optimization_data import OptimizationData, Solve
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.launch import launch
-from raytrace.tracing.trace import lens_steps
+from raytrace.tracing.trace import lens_steps, without_apertures
 from raytrace.words import RaytraceWarning, calling_level
 
 #: Points of the pupil whose rays are highest on a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
 
+_SIZE = "semi_diameter"
+_SAME = 1e-6  # of a stored automatic semi-diameter: a smaller difference leaves its digits
 _HEIGHTS = 65  # at which two surfaces are compared
 _LEAST = 1e-6  # mm: an overlap that counts
 
@@ -108,52 +111,107 @@ def semi_diameter_margin(lens: Lens, k: int) -> tuple[float, float]:
 
 
 def semi_diameters(lens: Lens) -> list[float]:
-    """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
-    fixed, last = fixed_semi_diameters(lens), len(lens.surfaces) - 1
-    sizes = [fixed.get(k, math.nan) for k in range(last + 1)]
-    if all(map(math.isfinite, sizes[1:last])):
-        return sizes
+    """Clear semi-diameters in mm of every surface, as a lens is printed, drawn and written; nan: unknown.
+
+    The fixed ones as stored; an automatic one is the largest of all configurations, but for those that a .zmx file has
+    stored as automatic: they are of the current configuration, as in OpticStudio. No automatic one clips a ray; a
+    coordinate break has none.
+    """
+    lens = detached(lens)
+    numbers, fixed = range(1, len(lens.surfaces)), fixed_semi_diameters(lens)
+    with torch.no_grad():
+        sizes = clear_semi_diameters(lens, numbers)
+        if shared := [k for k in numbers if k not in fixed and _is_of_all_configurations(lens, k)]:
+            for state in lens.configurations if lens.operands else ():
+                for k, size in clear_semi_diameters(state, shared).items():
+                    sizes[k] = torch.fmax(sizes[k], size)
+    automatic = {k: math.nan if lens.surfaces[k].is_break else float(size) for k, size in sizes.items()}
+    return [fixed.get(k, automatic.get(k, math.nan)) for k in range(len(lens.surfaces))]
+
+
+def _is_of_all_configurations(lens: Lens, k: int) -> bool:
+    """Whether an automatic semi-diameter is the largest of all configurations: by its rule, or as none is stored."""
+    data = lens.optimization_data
+    rules = () if data is None else data.kept
+    is_maximum = any(rule.surface == k and rule.is_largest_size for rule in rules)
+    return is_maximum or not lens.surfaces[k].semi_diameter
+
+
+def with_semi_diameters(
+    lens: Lens, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
+) -> Lens:
+    """As `Lens.with_semi_diameters`."""
+    data = lens.optimization_data or OptimizationData(semi_diameters=tuple(fixed_semi_diameters(lens)))
+    if margin is not None:
+        if len(margin) != 2 or not all(math.isfinite(part) and part >= 0 for part in margin):
+            raise ValueError(f"margin {margin}: expected per cent and mm, both 0 or more, as (2, 0.5)")
+        data = dataclasses.replace(data, semi_diameter_margin=(float(margin[0]), float(margin[1])))
+    if fixed is not None:
+        if not all(0 < k < len(lens.surfaces) for k in fixed):
+            raise ValueError(f"fixed semi-diameters of surfaces {list(fixed)}: expected 1 to {len(lens.surfaces) - 1}")
+        given = tuple(k for k in data.semi_diameters if k in fixed)  # the others of `fixed` are stored first
+        data = dataclasses.replace(data, semi_diameters=given)
+    if fixed is not None or margin is not None:
+        lens = dataclasses.replace(lens, optimization_data=data)
+    if lens.count is not None:
+        return lens
+    set_by_others = {
+        scaled.path[1] for operand in lens.operands for scaled in operand.paths if scaled.path[-1] == _SIZE
+    }
+    set_by_others |= {rule.surface for rule in data.kept if rule.quantity == _SIZE and not rule.is_largest_size}
+    set_by_others |= {lens.stop} if lens.aperture.kind == "float_by_stop" else set()
+    surfaces, rules = list(lens.surfaces), []
+    for k, size in enumerate(semi_diameters(lens)):
+        stored = surfaces[k].semi_diameter
+        is_given = k in data.semi_diameters or k in set_by_others or surfaces[k].sag_terms is not None
+        if is_given or not size > 0 or (stored and abs(size - stored) < _SAME * stored):
+            continue
+        surfaces[k] = dataclasses.replace(surfaces[k], semi_diameter=size)
+        if lens.operands and not stored:
+            rules.append(Solve(k, _SIZE, "maximum"))
+    if fixed is None and all(new is old for new, old in zip(surfaces, lens.surfaces, strict=True)):
+        return lens
+    kept = tuple(sorted((*data.kept, *rules), key=lambda rule: rule.surface))
+    data = dataclasses.replace(data, kept=kept, semi_diameters=tuple(sorted(fixed or data.semi_diameters)))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces), optimization_data=data)
+
+
+def clear_semi_diameters(lens: Lens, numbers: Sequence[int]) -> dict[int, Tensor]:
+    """mm () of some surfaces from 1, in the current configuration, with derivatives; of a batch of lenses (L,).
+
+    As stored where it is fixed or where no ray arrives, else a h + c: h is the largest height of the rays through the
+    ends of the two diameters of the pupil, of all fields and wavelengths, and a and c are the margin. nan: unknown.
+    """
+    sizes = {k: lens.wavelengths.new_tensor(size) for k, size in fixed_semi_diameters(lens).items()}
+    automatic = [k for k in numbers if k not in sizes]
     try:
-        reaches = [math.nan, *map(float, _reaches(lens, last))]
+        reaches = _reaches(lens, max(automatic)) if automatic else []
     except (ValueError, RuntimeError):
-        reaches = [math.nan] * (last + 1)
-    for k, reach in enumerate(reaches):
-        if math.isnan(sizes[k]):
-            factor, length = semi_diameter_margin(lens, k)
-            sizes[k] = factor * reach + length
-    stored = [surface.semi_diameter or math.nan for surface in lens.surfaces]
-    return [of_file if math.isnan(size) else size for size, of_file in zip(sizes, stored, strict=True)]
+        reaches = []
+    for k in automatic:
+        factor, length = semi_diameter_margin(lens, k)
+        stored = lens.wavelengths.new_tensor(lens.surfaces[k].semi_diameter or math.nan)
+        reach = factor * reaches[k - 1] + length if reaches else stored
+        sizes[k] = torch.where(torch.isfinite(reach), reach, stored)
+    return {k: sizes[k] for k in numbers}
 
 
 def semi_diameter(lens: Lens, k: int) -> Tensor:
-    """mm () of surface k, from 1, as in `semi_diameters`, with derivatives; of a batch of lenses (L, 1, 1, 1)."""
-    if size := fixed_semi_diameters(lens).get(k):
-        return lens.wavelengths.new_tensor(size)
-    factor, length = semi_diameter_margin(lens, k)
-    return factor * per_lens(_reaches(lens, k)[-1]) + length
+    """mm () of surface k, as of `clear_semi_diameters`; of a batch of lenses (L, 1, 1, 1)."""
+    return per_lens(clear_semi_diameters(lens, [k])[k])
 
 
 def contact_heights(lens: Lens, numbers: Sequence[int]) -> dict[int, Tensor]:
-    """mm () of some surfaces from 1, as in `semi_diameters`, with derivatives; of a batch of lenses (L,).
-
-    A surface that no ray reaches and whose semi-diameter is not stored has its contact on the axis.
-    """
-    fixed = {k: lens.wavelengths.new_tensor(size) for k, size in fixed_semi_diameters(lens).items()}
-    free = [k for k in numbers if k not in fixed]
-    try:
-        reaches = _reaches(lens, max(free)) if free else []
-    except (ValueError, RuntimeError):
-        reaches = []
-    for k in free:
-        factor, length = semi_diameter_margin(lens, k)
-        stored = lens.wavelengths.new_tensor(lens.surfaces[k].semi_diameter or 0.0)
-        reach = factor * reaches[k - 1] + length if reaches else stored
-        fixed[k] = torch.where(torch.isfinite(reach), reach, stored)
-    return {k: fixed[k] for k in numbers}
+    """mm () of some surfaces, as of `clear_semi_diameters`; 0, contact on the axis, where it is unknown."""
+    return {k: torch.where(torch.isfinite(h), h, 0.0) for k, h in clear_semi_diameters(lens, numbers).items()}
 
 
 def _reaches(lens: Lens, last: int) -> list[Tensor]:
-    """Largest √(x² + y²) mm () of the outermost rays on the surfaces 1 to `last`; nan where none arrives."""
+    """Largest √(x² + y²) mm () of the outermost rays on the surfaces 1 to `last`; nan where none arrives.
+
+    No aperture clips these rays: neither in OpticStudio, whose automatic semi-diameters they give.
+    """
+    lens = without_apertures(lens)
     points = lens.wavelengths.new_tensor(ENDS, dtype=torch.float64).T
     rays, reaches = launch(lens, points, wavelengths=lens.wavelengths), []
     for crossing in islice(lens_steps(lens, rays, lens.wavelengths[:, None]), last):

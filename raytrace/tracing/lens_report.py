@@ -20,7 +20,7 @@ from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, vertex_curvature
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
-from raytrace.tracing.geometry import defects, warn_of_defects
+from raytrace.tracing.geometry import defects, fixed_semi_diameters, semi_diameters, warn_of_defects
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import LINES, first_order
 from raytrace.tracing.trace import aiming_of
@@ -135,10 +135,8 @@ class Info(Result):
     def columns(self) -> dict[str, Tensor]:
         lens = detached(self.lens)
         surfaces, like = lens.surfaces, lens.wavelengths
-        rows = [
-            (_radius(s), float(s.thickness), math.nan if s.semi_diameter is None else s.semi_diameter) for s in surfaces
-        ]
-        radius, thickness, size = like.new_tensor(rows).T
+        radius, thickness = like.new_tensor([(_radius(s), float(s.thickness)) for s in surfaces]).T
+        size = like.new_tensor(semi_diameters(lens))
         surface, index = torch.arange(len(surfaces)), like.new_tensor(_indices(lens))
         shape = {"surface": surface, "radius": radius, "thickness": thickness, "glass": surface, "index": index}
         return shape | {"semi_diameter": size, "note": surface}
@@ -151,6 +149,7 @@ class Info(Result):
     def document(self) -> dict:
         lens = detached(self.lens)
         indices, geometry = media(lens, lens.wavelengths), [defect.document() for defect in defects(lens)]
+        sizes, fixed = semi_diameters(lens), fixed_semi_diameters(lens)
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
@@ -181,7 +180,8 @@ class Info(Result):
                     "thickness": number(surface.thickness),
                     "glass": label(surface.glass) or None,
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
-                    "semi_diameter": number(surface.semi_diameter),
+                    "semi_diameter": number(sizes[k]),
+                    "semi_diameter_is_fixed": k in fixed,
                     "comment": surface.comment,
                     **_environment(surface),
                     **({} if surface.expansion is None else {"expansion": number(surface.expansion)}),

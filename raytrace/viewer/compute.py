@@ -31,7 +31,7 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, computed_once, field_label, field_points, shared
 from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
-from raytrace.tracing.geometry import defects
+from raytrace.tracing.geometry import defects, semi_diameters
 from raytrace.tracing.launch import unfilled
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
@@ -268,7 +268,7 @@ def prescription(state: State) -> dict:
     lens = _detached(state.lens)
     data = lens.optimization_data
     follows = {word_of(solve) for solve in (data.solves if data else ())}
-    rows, last = [], len(lens.surfaces) - 1
+    rows, last, sizes = [], len(lens.surfaces) - 1, semi_diameters(lens)
     for k, surface in enumerate(lens.surfaces):
         numbers = {} if k == last else {"thickness": surface.thickness}
         if k > 0:
@@ -286,7 +286,7 @@ def prescription(state: State) -> dict:
                     name: slider_ends(lens, k, name, value) for name, value in values.items() if math.isfinite(value)
                 },
                 "glass": None if k == last or surface.is_break else label(surface.glass),
-                "semi_diameter": surface.semi_diameter,
+                "semi_diameter": plain(sizes[k]),
                 "comment": surface.comment,
                 "stop": k == lens.stop,
                 "vary": sorted(here[0]),

@@ -57,7 +57,18 @@ RING = "RING"
 
 #: Data that CODE V has no command for are in comments, `!raytrace catalogs SCHOTT OHARA`.
 COMMENT = "!RAYTRACE"
-_COMMENT_WORDS = ("AIMING", "BREAK", "CATALOGS", "CONDITIONS", "EXPANSION", "NOTE", "RADIUS", "UNNAMED", "VARIABLES")
+_COMMENT_WORDS = (
+    "AIMING",
+    "AUTOMATIC",
+    "BREAK",
+    "CATALOGS",
+    "CONDITIONS",
+    "EXPANSION",
+    "NOTE",
+    "RADIUS",
+    "UNNAMED",
+    "VARIABLES",
+)
 
 #: Decentres and tilts by the numbers of a pose; tilts about x and y are left-handed: their sign changes.
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}

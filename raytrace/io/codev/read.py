@@ -35,6 +35,7 @@ from raytrace.io.assembly import (
     assemble,
     clear_aperture,
     poses_of,
+    with_written_automatic,
     with_written_conditions,
     with_written_variables,
 )
@@ -150,7 +151,11 @@ def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> 
             draft.sources[quantity] = (keyword, record.place)
     lens = assemble(draft, file)
     _report_left_out(system, report)
-    for keyword, read_into in (("VARIABLES", with_written_variables), ("CONDITIONS", with_written_conditions)):
+    for keyword, read_into in (
+        ("AUTOMATIC", with_written_automatic),
+        ("VARIABLES", with_written_variables),
+        ("CONDITIONS", with_written_conditions),
+    ):
         for record in parts.comments:
             if record.keyword == keyword:
                 lens = read_into(lens, record.text, record.place)

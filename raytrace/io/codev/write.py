@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.assembly import written_conditions, written_variables
+from raytrace.io.assembly import written_automatic, written_conditions, written_variables
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import (
     APERTURES,
@@ -108,6 +108,7 @@ def _comments(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     return [
         *(f"{start} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
         f"{start} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{start} catalogs",
+        f"{start} automatic {automatic}" if (automatic := written_automatic(lens)) else "",
         f"{start} variables {variables}" if (variables := written_variables(lens)) else "",
         f"{start} conditions {conditions}" if (conditions := written_conditions(lens, place)) else "",
         f"{start} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",

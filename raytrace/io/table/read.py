@@ -39,6 +39,7 @@ from raytrace.io.assembly import (
     clear_aperture,
     is_code,
     listed_glass,
+    with_written_automatic,
     with_written_conditions,
     with_written_variables,
 )
@@ -387,6 +388,7 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: CatalogSources
     places = {row.place.surface: row.place for row in rows}
     for surface, message in unknown_changes(lens).items():
         table.report.warn(message, places.get(surface, table.place))
+    lens = with_written_automatic(lens, *table.metadata.get("automatic", ("", table.place)))
     lens = with_written_variables(lens, *table.metadata.get("variables", ("", table.place)))
     return with_written_conditions(lens, *table.metadata.get("conditions", ("", table.place)))
 

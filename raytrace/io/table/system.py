@@ -19,6 +19,7 @@
 # ray aiming: paraxial
 # temperature: 40                °C, of the glasses and the air
 # pressure: 1                    atm, of the air; 0 is vacuum
+# automatic: 1 3 4 margin 5 0.1    semi-diameters that follow the rays, and what is added to them, per cent and mm
 # variables: curvature_1 thickness_2:1..20    with their bounds, mm and 1/mm
 # conditions: efl=100 edge>=1    met exactly by optimisations (`optimization.conditions`), mm
 """
@@ -31,7 +32,13 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.io.assembly import catalogs_needed, environment_at, written_conditions, written_variables
+from raytrace.io.assembly import (
+    catalogs_needed,
+    environment_at,
+    written_automatic,
+    written_conditions,
+    written_variables,
+)
 from raytrace.io.source import (
     LensFileError,
     Place,
@@ -243,6 +250,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
         ("ray aiming", "" if lens.ray_aiming == "auto" else lens.ray_aiming),
         *written_environment(lens.environment, place).items(),
+        ("automatic", written_automatic(lens)),
         ("variables", written_variables(lens)),
         ("conditions", written_conditions(lens, place)),
     ]

@@ -26,7 +26,7 @@ _KEYS = (
     "title, name; note, notes; units, unit; ignore; object distance; stop, stop surface; aperture, system aperture"
     "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; afocal; wavelengths, wavelength"
     "; wavelength weights, weights; primary wavelength, primary; catalogs, catalog, glass catalogs; ray aiming"
-    "; temperature; pressure; variables; conditions"
+    "; temperature; pressure; automatic; variables; conditions"
 )
 KEYS = {spelling: row.split(", ")[0] for row in _KEYS.split("; ") for spelling in row.split(", ")}
 

@@ -368,6 +368,8 @@ def read(
             raise LensFileError(message, surfaces[min(solve.surface, len(surfaces) - 1)].block.place)
     kept = tuple(solve for solve in solves if not _is_followed(solve, lens))
     for solve in kept:
+        if solve.is_largest_size:
+            continue
         report.note(f"kept, and not followed when the lens is optimised: {solve}")
     lines = [record for record in sections.tail if record.keyword in TOLERANCES]  # also behind the configurations
     variables, merit = _with_bounds(variables, merit_rows(tail, report))
