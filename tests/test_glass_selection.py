@@ -107,7 +107,7 @@ def test_classes_of_resistance(resistant):
 
 def test_a_list_states_what_it_leaves_out():
     listing = rt.glasses(catalogs=["SCHOTT"])
-    summary = "125 of 366 glasses of SCHOTT; left out: 232 obsolete, 6 radiation_hard, 3 special (the words obsolete"
+    summary = "125 of 366 glasses of SCHOTT; left out: 232 obsolete, 6 radiation_hard, 3 special (the word any adds"
     assert listing.summary.startswith(summary)
     text = str(rt.glasses("radiation_hard density>=5.19 density<=5.22", catalogs=["SCHOTT"]))
     assert re.search(r"SF6G05 +SCHOTT +preferred, radiation-hard +1.80906 +25.27 +2.9 +5.2 +7.8", text)
@@ -131,7 +131,7 @@ def test_other_words_are_refused(words, message):
         Selection.of(words)
 
 
-def test_the_command_lists_glasses(capsys):
+def test_the_command_lists_glasses(capsys, tmp_path):
     assert (
         main(["glasses", "preferred", "price<=1.6", "transmittance:0.4>=0.998", "--catalog", "SCHOTT", "--json"]) == 0
     )
@@ -140,5 +140,8 @@ def test_the_command_lists_glasses(capsys):
     assert (glass["glass"], glass["status"], glass["price"]) == ("N-BK7HT", "preferred", 1.6)
     assert glass["transmittance:0.4"] == pytest.approx(0.9984, abs=1e-6)
     assert document["left_out"]["obsolete"] == 232
+    assert main(["glasses", "preferred", "price<=1.2", "--catalog", "SCHOTT", "-o", str(tmp_path / "glasses.csv")]) == 0
+    header, first, *_ = (tmp_path / "glasses.csv").read_text("utf-8").splitlines()
+    assert (header, first[:18]) == ("glass,catalog,status,nd,vd,price,density,expansion", "N-BAK1,SCHOTT,pref")
     assert main(["glasses", "dear"]) == 1
     assert "expected preferred, standard" in capsys.readouterr().err

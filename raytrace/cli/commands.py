@@ -645,7 +645,9 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         any 'climate<=2' 'acid<=2' --catalog my_glasses.agf --json""",
         Option("words", None, "WORD", "statuses and limits (default: preferred standard unlisted)", flag="words",
                nargs="*", default=""),
-        "catalog", "json", row("wavelengths", "wavelengths in µm that the range of each glass covers"), TABLE,
+        row("catalog", "catalog to list, an .agf file or the name of a shipped one; may be repeated (default: those of "
+            "RAYTRACE_CATALOGS and all shipped ones)"),
+        "json", row("wavelengths", "wavelengths in µm that the range of each glass covers"), TABLE,
         "max_bytes", run="cli.runs:glasses",
     ),
     _command(

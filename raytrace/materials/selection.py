@@ -53,7 +53,11 @@ FIGURES: dict[str, Callable[[Glass], float | None]] = {
     **{name: lambda glass, name=name: glass.resistance.get(name) for name in RESISTANCE},  # type: ignore[misc]
 }
 _TRANSMITTANCE = "transmittance"
-_LISTED = ("price", "density", "expansion")  # columns of every table, besides n_d and V_d
+#: Columns of every table, behind the names.
+_COLUMNS = (
+    Column("nd", form=".5f"), Column("vd", form=".2f"), Column("price"), Column("density", "g/cm³"),
+    Column("expansion", "1e-6/K"),
+)  # fmt: skip
 _LIMIT = re.compile(r"(?P<name>[a-z]+)(:(?P<wavelength>[\d.]+))?(?P<sign><=|>=)(?P<bound>-?\d+\.?\d*|\.\d+)")
 _MANY = 5  # catalogs whose names are not listed
 
@@ -164,6 +168,8 @@ class GlassList(Result):
     whose figures are columns of the table.
     """
 
+    COLUMNS = _COLUMNS
+
     glasses: tuple[Glass, ...]
     catalogs: tuple[str, ...]
     left_out: tuple[tuple[str, int], ...]
@@ -171,15 +177,26 @@ class GlassList(Result):
 
     @property
     def summary(self) -> str:
-        """Numbers of the glasses that pass and of those left out, with the words that let these pass."""
+        """Numbers of the glasses that pass and of those left out, with the word that lets these pass."""
         count = len(self.glasses) + sum(number for _, number in self.left_out)
         source = ", ".join(self.catalogs) if len(self.catalogs) < _MANY else f"{len(self.catalogs)} catalogs"
         parts = [f"{number} {reason}" for reason, number in self.left_out]
-        words = [reason for reason, _ in self.left_out if reason in (*_WORDS, RADIATION_HARD)]
+        words = {reason for reason, _ in self.left_out} & {*_WORDS, RADIATION_HARD}
         sentence = f"{len(self.glasses)} of {count} glasses of {source}"
         left_out = f"; left out: {', '.join(parts)}" if parts else ""
-        hint = f" (the words {', '.join(words)}, or {_ANY}, add these)" if words else ""
+        hint = f" (the word {_ANY} adds all statuses and radiation-hard glasses)" if words else ""
         return sentence + left_out + hint
+
+    def columns(self) -> dict[str, Tensor]:
+        listed, texts = columns_of(self.glasses, self.limits, blank=float("nan")), self.words()
+        rows = {column.name: values for column, values in listed.items()}
+        places = {name: [known.index(text) for text in rows[name]] for name, known in texts.items()}
+        figures = {name: torch.tensor(rows[name], dtype=torch.float64) for name in rows.keys() - texts.keys()}
+        return {name: torch.tensor(places[name]) if name in places else figures[name] for name in rows}
+
+    def words(self) -> dict[str, Sequence[str]]:
+        texts = [*columns_of(self.glasses).items()][:3]
+        return {column.name: [*dict.fromkeys(values)] for column, values in texts}
 
     def tables(self) -> list[Table]:
         return [Table(columns_of(self.glasses, self.limits), [self.summary, ""])]
@@ -193,18 +210,14 @@ class GlassList(Result):
         }
 
 
-def columns_of(glasses: Sequence[Glass], limits: Sequence[Limit] = (), blank: str | None = "-") -> Columns:
+def columns_of(glasses: Sequence[Glass], limits: Sequence[Limit] = (), blank: object = "-") -> Columns:
     """Name, catalog, status, n_d, V_d, price, density and expansion of glasses, and the figures of limits.
 
     blank: of a figure that is not listed.
     """
-    further = {limit.heading: limit.figure for limit in limits}
-    figures: dict[Column, Callable[[Glass], float | None]] = {
-        Column("nd", form=".5f"): FIGURES["nd"],
-        Column("vd", form=".2f"): FIGURES["vd"],
-        **{Column(name): FIGURES[name] for name in _LISTED},
-        **{Column(name): figure for name, figure in further.items() if name not in ("nd", "vd", *_LISTED)},
-    }
+    names = [column.name for column in _COLUMNS]
+    figures = {column: FIGURES[column.name] for column in _COLUMNS}
+    figures |= {Column(limit.heading): limit.figure for limit in limits if limit.name not in names}
     return {
         Column("glass", form="<"): [glass.listed_name or glass.name for glass in glasses],
         Column("catalog", form="<"): [glass.catalog for glass in glasses],
