@@ -58,6 +58,7 @@ PUBLIC = {
     "find_glass": "materials.catalogs",
     "nearest_glasses": "materials.catalogs",
     "glass": "materials.properties",
+    "glasses": "materials.selection",
     "internal_transmittance": "materials.glass",
     "refractive_index": "materials.glass",
     # rays
@@ -208,6 +209,7 @@ ERRORS = {
     "BadPrescription": "system.prescription",
     "BadRow": "optimization.operands.operand",
     "BadSearch": "optimization.search_tasks",
+    "BadSelection": "materials.selection",
     "BadSettings": "cli.settings",
     "BadSubstitute": "io.source",
     "BadTolerance": "tolerancing.table",
@@ -289,8 +291,9 @@ ERRORS = {
 #: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All
 #: others are names of their packages, `rt.imaging.blur`.
 TOP = (
-    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "view", "glass", "to"),
-    *("trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare", "seidel"),
+    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "view", "glass"),
+    *("glasses", "to", "trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare"),
+    "seidel",
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
     *("rms_over_field", "sag", "thermal", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance"),

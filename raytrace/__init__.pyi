@@ -86,6 +86,8 @@ from raytrace.materials.glass import InvalidIndex as InvalidIndex
 from raytrace.materials.glass import NoMelt as NoMelt
 from raytrace.materials.glass import OutOfRange as OutOfRange
 from raytrace.materials.properties import glass as glass
+from raytrace.materials.selection import BadSelection as BadSelection
+from raytrace.materials.selection import glasses as glasses
 from raytrace.maths.arrays import ArrayError as ArrayError
 from raytrace.maths.numerics import to as to
 from raytrace.optimization.attained import NotReached as NotReached

@@ -55,7 +55,8 @@ class CodesignSettings(Settings):
     variables, "sag" or "blur"; optimizer: of the lens, "lm", steps of second order to the optimum of the closed form,
     behind which the network is trained, or "adam", together with the network; turns: of the lens, by steps of second
     order for the loss of a network that adapts to it, and of the network again, as many epochs; relearn: epochs of step
-    1 again with the nearest glasses of the catalogs, in place of model glasses that vary; filters: of the closed form,
+    1 again with the nearest glasses of the catalogs, in place of model glasses that vary; glasses: a selection of them,
+    as text (`rt.glasses`); filters: of the closed form,
     "separate" or "joint", of colours; glass_thickness, air_thickness, edge: limits; start: of the sensor, for an object
     at focus_distance; near, far, spread: range and distribution of object distances; fields: points in y, one after the
     other for successive samples; pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its
@@ -79,6 +80,7 @@ class CodesignSettings(Settings):
     optimizer: Literal["adam", "lm"] = "lm"
     turns: int = 0
     relearn: int = 0
+    glasses: str = ""
     filters: str = "separate"
     start: str = "paraxial"
     focus_distance: float = 25e3

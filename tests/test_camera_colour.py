@@ -440,6 +440,18 @@ def test_glasses_that_vary_snap_to_the_catalog_and_the_rest_is_learned_again(tri
     assert torch.equal([*other.network.parameters()][-1], [*one.network.parameters()][-1])
 
 
+def test_glasses_that_vary_snap_to_selected_glasses(triplet):
+    words = "preferred price<=1.5"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VariedGlass)
+        variables = rt.Variables(triplet, "index:1,3 abbe_number:1,3 sensor", hold="catalog", glasses=words)
+        free = rt.Variables(triplet, "index:1,3 abbe_number:1,3 sensor", hold="catalog")
+    prices = [variables.snapped().surfaces[k].glass.relative_price for k in (1, 3)]
+    assert all(price <= 1.5 for price in prices)
+    dear = [free.snapped().surfaces[k].glass.relative_price for k in (1, 3)]
+    assert any(price is None or price > 1.5 for price in dear)  # None: not listed
+
+
 def test_filters_of_places_are_wiener_filters_of_their_kernels(triplet, pictures):
     one = initial_camera(triplet, SETTINGS)
     spectrum, distances = patch_spectrum(pictures[0], 26, crops=1), even_distances(one, 3)

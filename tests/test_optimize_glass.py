@@ -16,7 +16,6 @@ from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
 from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.glass_choice import (
-    STATUSES,
     Choice,
     DescendedDesign,
     Design,
@@ -94,13 +93,26 @@ def test_numbers_of_a_glass_give_its_indices_at_the_wavelengths_of_the_lens(wave
 
 def test_glasses_to_choose_from_are_current_and_cover_the_wavelengths(triplet):
     pool = pool_of(triplet, catalogs_of(triplet))
-    assert {glass.status for glass in pool.glasses} <= set(STATUSES)
+    assert {glass.status for glass in pool.glasses} == {"preferred", ""}
     assert "N-BK7" in {glass.name for glass in pool.glasses}
     assert "SK4" not in {glass.name for glass in pool.glasses}
     assert all(glass.wavelength_range[0] <= 0.4861 and glass.wavelength_range[1] >= 0.6563 for glass in pool.glasses)
     assert {glass.catalog for glass in pool_of(triplet, catalogs_of(triplet, ["OHARA"])).glasses} == {"OHARA"}
     with pytest.raises(NoProblem, match="catalog"):
         catalogs_of(triplet, ["NOWHERE"])
+
+
+def test_radiation_hard_glasses_are_not_chosen_unless_asked_for(triplet):
+    """SF6G05 is preferred by its maker, and transmits 0.36 of blue light at 0.46 µm."""
+    catalogs = catalogs_of(triplet, ["SCHOTT"])
+    names = {words: {glass.name for glass in pool_of(triplet, catalogs, words).glasses} for words in ("", "any")}
+    assert "SF6" in names[""]
+    assert not names[""] & {"BK7G18", "F2G12", "SF6G05"}
+    assert {"BK7G18", "F2G12", "SF6G05", "SK4"} <= names["any"]
+    cheap = pool_of(triplet, catalogs, ["preferred", "price<=1.5"])
+    assert {glass.relative_price <= 1.5 for glass in cheap.glasses} == {True}
+    with pytest.raises(NoProblem, match=r"0 of 366 glasses of SCHOTT; left out: .*acid not listed.*glasses.*catalog"):
+        pool_of(triplet, catalogs, "acid<=1")
 
 
 # -- the expansion -----------------------------------------------------------------------------------------------------
@@ -227,8 +239,14 @@ def test_the_command_prints_the_sequence(capsys):
     assert {step["glass"] for step in steps[2]["tried"]} & set(shipped_catalog("HOYA").glasses)
     assert steps[2]["surface"] == 3
     assert steps[2]["tried"]
-    main([*words, "--cycles", "2"])
-    assert re.search(r"surface 3: \S+ \(SCHOTT\)", capsys.readouterr().out)
+    assert re.search(r"of 432 glasses of HOYA; left out: 196 obsolete", document["chosen_from"])
+    main([*words, "--cycles", "2", "--glasses", "preferred", "price<=2"])
+    text = capsys.readouterr().out
+    assert re.search(r"surface 3: \S+ \(SCHOTT\)", text)
+    assert re.search(r"of 366 glasses of SCHOTT; left out: 232 obsolete, .* not price<=2", text)
+    name, price = re.search(r"^ +3 +(\S+) +SCHOTT +preferred +\S+ +\S+ +(\S+)", text, re.MULTILINE).groups()
+    assert shipped_catalog("SCHOTT").glasses[name].relative_price == pytest.approx(float(price), rel=1e-5)
+    assert float(price) <= 2
 
 
 # -- interrupted -------------------------------------------------------------------------------------------------------

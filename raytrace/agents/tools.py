@@ -156,6 +156,7 @@ TOOLS = {
         Tool("tolerance"),
         Tool("convert"),
         Tool("glass"),
+        Tool("glasses"),
     )
 }
 

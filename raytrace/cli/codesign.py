@@ -74,6 +74,7 @@ ROWS = {
         "epochs of step 1 again, with the nearest catalog glasses in place of varied ones (index:1 abbe_number:1)",
         type=count,
     ),
+    "glasses": option(OPTIONS["glasses"].help, "WORD", nargs="+"),
     "filters": option(
         "of the closed form and of the comparison: a Wiener filter of each colour (separate, default), or one of all "
         "colours (joint)",

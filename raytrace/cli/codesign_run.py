@@ -138,7 +138,7 @@ def settings_of(arguments: argparse.Namespace, stored: Path | None = None) -> Co
         network = {"network": "red-net", "depth": preset.depth, "width": preset.width}
     given = given_settings(arguments, CodesignSettings)
     options = network | _wavelengths(arguments, given) | given | options
-    texts = ("vary", "bounds", "hold", "limits")
+    texts = ("vary", "bounds", "hold", "glasses", "limits")
     options |= {name: " ".join(options[name]) for name in texts if isinstance(options.get(name), list)}
     if arguments.fields:
         if any(x for x, _ in options["fields"]):

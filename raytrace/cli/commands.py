@@ -386,10 +386,11 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         double_gauss --merit spot --vary curvature thickness --seconds 10 -o better.zmx
         tessar --merit spot --vary curvature sensor thickness:2,4 --bounds thickness:1.. --hold efl=100
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
+        tessar --merit spot --vary curvature sensor glass --hold efl=100 --glasses preferred 'price<=2' -o cheap.zmx
         double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
+        *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses", AS_BUILT,
         group(
             "stopping",
             Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
@@ -662,6 +663,28 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         Option("name", None, "NAME", "name of a glass, as in a lens file, or a six-digit MIL code", flag="name"),
         "catalog", "json", row("wavelengths", "wavelengths in µm (default: F d C)"), "temperature", "pressure",
         "max_bytes", run="cli.runs:glass",
+    ),
+    _command(
+        "glasses",
+        "list glasses by status, price, transmittance and resistance",
+        "List the glasses of the catalogs that pass a selection: the glasses that 'optimize --vary glass' and codesign "
+        "choose from by the same words in --glasses. Without words these are preferred and standard glasses and those "
+        "of catalogs without statuses. Obsolete, special, melt and radiation-hard glasses are left out and counted. "
+        "Limits, in quotes: price<=3 (relative to the maker's BK7), density<=4 (g/cm³), expansion<=9 (1e-6/K), "
+        "nd>=1.7, vd<=40, transmittance:0.4>=0.98 (internal, of 10 mm at 0.4 µm), and classes of resistance climate "
+        "stain acid alkali phosphate, as acid<=2. A glass whose catalog does not list a figure does not meet its "
+        "limit: the shipped catalogs list no resistance, those of glass makers (.agf) do.",
+        """
+        --catalog SCHOTT
+        preferred 'price<=2' 'transmittance:0.4>=0.98' --catalog SCHOTT --catalog OHARA
+        'nd>=1.8' 'vd>=40' --wavelength 0.4 1.0
+        any 'climate<=2' 'acid<=2' --catalog my_glasses.agf --json""",
+        Option("words", None, "WORD", "statuses and limits (default: preferred standard unlisted)", flag="words",
+               nargs="*", default=""),
+        row("catalog", "catalog to list, an .agf file or the name of a shipped one; may be repeated (default: those of "
+            "RAYTRACE_CATALOGS and all shipped ones)"),
+        "json", row("wavelengths", "wavelengths in µm that the range of each glass covers"), TABLE,
+        "max_bytes", run="cli.runs:glasses",
     ),
     _command(
         "bench",

@@ -136,6 +136,9 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     # optimisation
     Option("seconds", positive_finite, "S", "time limit"),
     Option("vary", None, "WHAT", "variables, pickups and solves", nargs="+"),
+    Option("glasses", None, "WORD", "catalog glasses to choose from: statuses (preferred standard unlisted special "
+           "obsolete melt; default the first three), radiation_hard, any, and limits as 'price<=3' "
+           "'transmittance:0.4>=0.98' 'acid<=2' ('raytrace glasses' lists them)", nargs="+"),
     Option("grade", help="tolerances of a published grade (default: those of the file)", choices=GRADES),
     Option("limits", None, "NAME=LIMIT", "other limits, as radius=0.1% thickness=0.02 element_tilt=0.05; index=0 "
            "leaves one out", nargs="+"),

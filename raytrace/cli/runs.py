@@ -30,6 +30,11 @@ def glass(arguments: argparse.Namespace) -> Result:
     return raytrace.glass(**options_of(arguments), catalogs=catalogs(arguments))
 
 
+def glasses(arguments: argparse.Namespace) -> Result:
+    """The glasses of the catalogs that pass a selection."""
+    return raytrace.glasses(**options_of(arguments), catalogs=catalogs(arguments))
+
+
 def lenses(arguments: argparse.Namespace) -> Result:
     """The shipped lenses and the files of a folder."""
     return list_lenses(arguments.folder)

@@ -114,6 +114,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,
+        glasses=settings.glasses,
         step=settings.step,
     )
 

@@ -286,7 +286,8 @@ class Variables(Owned):
         constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
         "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`, and so are the
         conditions of the lens of other quantities.
-    catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT.
+    catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT; glasses: a selection of them,
+        as "preferred price<=3" (`rt.glasses`).
     step: unit of the parameters: "sag" as of `Variable`, or "blur": the change that spreads the rays of all fields by
         1 mm, RMS about their centroids, so that a rate of an optimiser means the same blur for all numbers of any lens.
     glass_thickness, air_thickness: minimum and maximum in mm on the axis; edge: minimum of glass at its edge; by
@@ -307,12 +308,13 @@ class Variables(Owned):
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
         catalog: Sequence[str | os.PathLike] = (),
+        glasses: str = "",
         step: Literal["sag", "blur"] = "sag",
     ):
         super().__init__()
         if step not in ("sag", "blur"):
             raise BadVariables(f"step {step!r}: expected sag or blur")
-        self.catalog = tuple(catalog)
+        self.catalog, self.glasses = tuple(catalog), glasses
         self.lens = lens = as_lens(lens, "Variables")
         #: The variables in double precision on the processor, and the lens with all of them modelled.
         self.design, words = _design(lens, vary), constraint_words(hold)
@@ -552,7 +554,7 @@ class Variables(Owned):
         if not surfaces:
             raise BadVariables(f"no glass varies: name its numbers in {option('vary')}, as index:1,3 abbe_number:1,3")
         lens = self.design.lens
-        pool = pool_of(lens, catalogs_of(lens, self.catalog))
+        pool = pool_of(lens, catalogs_of(lens, self.catalog), self.glasses)
         start = {k: lens.surfaces[k].glass.coefficients.numpy()[: pool.count] for k in surfaces}
         return GlassLimits(pool, start, columns)
 

@@ -7,3 +7,4 @@ from raytrace.materials.glass import internal_transmittance as internal_transmit
 from raytrace.materials.glass import refractive_index as refractive_index
 from raytrace.materials.mounts import MOUNTS as MOUNTS
 from raytrace.materials.properties import glass as glass
+from raytrace.materials.selection import glasses as glasses

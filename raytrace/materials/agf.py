@@ -14,7 +14,8 @@ from raytrace.files import encoding, read_bytes, write_text
 from raytrace.materials.glass import BY_NUMBER, FORMULAS, Glass
 from raytrace.words import RaytraceError, RaytraceWarning, calling_level
 
-_STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
+#: Statuses by their number in an NM record.
+STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
 _NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
 #: An unknown thermal coefficient is 0 in AGF, and its temperature 20 °C; any other unknown figure is -1.
@@ -245,7 +246,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
         wavelength_range=None if is_unknown else (shortest, longest),
-        status=_STATUSES.get(int(flags[1]), "") if len(flags) > 1 and flags[1].is_integer() else "",
+        status=STATUSES.get(int(flags[1]), "") if len(flags) > 1 and flags[1].is_integer() else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
         alternatives=tuple(listing[1].replace(",", " ").split()) if listing else (),
@@ -321,7 +322,7 @@ def _glass_lines(name: str, glass: Glass) -> list[str]:
         raise ValueError(f"glass {name!r} with formula {glass.formula!r} cannot be written as AGF")
     n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed or 0.0)
     code = f"{round(n * 1000) % 1000:03d}{round(v * 10) % 1000:03d}"
-    status = next((number for number, status in _STATUSES.items() if status == glass.status), -1)
+    status = next((number for number, status in STATUSES.items() if status == glass.status), -1)
     coefficients = glass.coefficients.tolist()
     padded = (*coefficients, *[0.0] * (10 - len(coefficients)))
     figures = [*glass.records, ("CD", padded), ("LD", glass.wavelength_range or (0.0, 0.0))]

@@ -21,6 +21,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -145,10 +146,7 @@ def nearest_glasses(
     catalogs that came with a lens; by default the user's and all shipped ones. user: AGF files, searched first. Raises
     UnknownGlass, CatalogError for an unknown catalog, ValueError for a medium without n_d and V_d.
     """
-    of_user = [load(path) for path in user_catalogs(user)]
-    sought = [catalog if isinstance(catalog, Catalog) else _named_catalog(catalog, of_user) for catalog in catalogs]
-    if not catalogs:  # BIREFRINGENT holds one ray of a crystal each
-        sought = of_user + [shipped_catalog(name) for name in SHIPPED if name != "BIREFRINGENT"]
+    sought = catalogs_named(catalogs, user=user)
     if isinstance(glass, str):
         glass = find_glass(glass, user=user)
     index, dispersion = _nd_and_vd(glass) if isinstance(glass, Glass) else map(float, glass)
@@ -167,8 +165,28 @@ def nearest_glasses(
     return tuple(sorted(others, key=distance)[:count])
 
 
-def _named_catalog(name: str, of_user: Sequence[Catalog]) -> Catalog:
-    return next((catalog for catalog in of_user if catalog.name.upper() == name.upper()), None) or shipped_catalog(name)
+def catalogs_named(
+    catalogs: Sequence[str | PathLike | Catalog] = (), *, user: Sequence[str | Path] = ()
+) -> tuple[Catalog, ...]:
+    """Catalogs by the name of a user's or a shipped one, or by their AGF file; a Catalog passes as it is.
+
+    By default the user's and all shipped ones, except BIREFRINGENT, whose entries are single rays of a crystal. Raises
+    CatalogError.
+    """
+    of_user = [load(path) for path in user_catalogs(user)]
+    if not catalogs:
+        return (*of_user, *(shipped_catalog(name) for name in SHIPPED if name != "BIREFRINGENT"))
+    by_name = {catalog.name: catalog for catalog in reversed(of_user)}
+
+    def catalog_of(catalog: str | PathLike | Catalog) -> Catalog:
+        if isinstance(catalog, Catalog):
+            return catalog
+        if (known := by_name.get(str(catalog).upper())) is not None:
+            return known
+        path = Path(catalog)
+        return load(path) if path.suffix or path.is_file() else shipped_catalog(str(catalog))
+
+    return tuple(catalog_of(catalog) for catalog in catalogs)
 
 
 def _nd_and_vd(glass: Glass) -> tuple[float, float]:

@@ -227,6 +227,9 @@ LINES = {"i": 0.3650146, "h": 0.4046561, "g": 0.4358343, "F'": 0.4799914, "F": 0
 LINES |= {"d": 0.5875618, "D": 0.5892938, "C'": 0.6438469, "C": 0.6562725, "r": 0.7065188, "s": 0.8521100}
 LINES |= {"t": 1.0139800}
 
+#: Classes of resistance in the order of an OD record: CR, FR, SR, AR and PR.
+RESISTANCE = ("climate", "stain", "acid", "alkali", "phosphate")
+
 #: Relative slack at the ends of a wavelength range: a few float32 spacings.
 _RANGE_SLACK = 1e-6
 
@@ -306,6 +309,14 @@ class Glass:
         """Rows (wavelength µm, internal transmittance, thickness mm) by wavelength; empty if not listed."""
         rows = (numbers for keyword, numbers in self.records if keyword == "IT" and len(numbers) > 2)
         return tuple(sorted((wavelength, passed, depth) for wavelength, passed, depth, *_ in rows))
+
+    @property
+    def resistance(self) -> dict[str, float]:
+        """Classes of resistance of RESISTANCE that are listed: to climate, stain, acid, alkali and phosphate."""
+        numbers = next((numbers[1:6] for keyword, numbers in self.records if keyword == "OD"), ())
+        classes = dict(zip(RESISTANCE, numbers, strict=False))
+        is_listed = any(number > 0 for number in classes.values())  # then stain 0 is a class, the best one
+        return {name: c for name, c in classes.items() if c > 0 or (name == "stain" and c == 0 and is_listed)}
 
     def _figure(self, keyword: str, place: int) -> float | None:
         numbers = next((numbers for word, numbers in self.records if word == keyword), ())

@@ -21,15 +21,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull, QhullError
 
-from raytrace.materials.catalogs import Catalog, CatalogError, load, missing_catalogs, shipped_catalog
-from raytrace.materials.glass import Glass, is_air, model_glass, refractive_index
+from raytrace.materials.catalogs import Catalog, CatalogError, catalogs_named, missing_catalogs
+from raytrace.materials.glass import Glass, model_glass, refractive_index
+from raytrace.materials.selection import GlassList
+from raytrace.materials.selection import glasses as selected
 from raytrace.optimization.checkpoint import BadCheckpoint, Stored
 from raytrace.optimization.conditions import Condition
 from raytrace.optimization.least_squares import Evaluate, SumOfSquares, least_squares
@@ -42,15 +43,24 @@ from raytrace.words import option
 
 _MATTERS = 1e-6  # smallest change of the index at the wavelengths by a number of a glass that varies
 
-#: Statuses of glasses that are chosen, and the factor on the merit with such a glass.
-STATUSES = {"preferred": 1.0, "standard": 1.03, "": 1.03}
+_NOT_PREFERRED = 1.03  # factor on the merit with a glass that its maker does not prefer
 _PRICE = 0.02  # exponent of the relative price of a glass in the factor on the merit
 
 
 class Pool:
     """Glasses to choose from: their numbers (G, k) and the hull of these, normal (F, k) · p ≤ reach (F,)."""
 
-    def __init__(self, glasses: Sequence[Glass], wavelengths: torch.Tensor):
+    def __init__(
+        self,
+        glasses: Sequence[Glass],
+        wavelengths: torch.Tensor,
+        listing: GlassList | None = None,
+        *,
+        is_specified: bool = False,
+    ):
+        """listing: the selection that the glasses are of; is_specified: by words, which then hold for the glasses of
+        the lens as well."""
+        self.listing, self.is_specified = listing, is_specified
         self.wavelengths, self.basis = wavelengths, _basis(wavelengths)
         self.glasses = tuple(glasses)
         numbers = np.array([self.numbers_of(glass) for glass in self.glasses]).reshape(-1, self.count)
@@ -119,37 +129,33 @@ def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def catalogs_of(lens: Lens, catalog: Sequence[str | PathLike] = ()) -> tuple[Catalog, ...]:
-    """Catalogs by name or AGF file; by default those of the lens, else SCHOTT. Raises CatalogError and NoProblem."""
+    """Catalogs by name or AGF file; by default those of the lens, else SCHOTT. Raises NoProblem."""
     shipped = [name for name in lens.catalogs if name not in missing_catalogs([name])]
-    catalogs = []
-    for name in catalog or shipped or ("SCHOTT",):
-        if Path(name).suffix or Path(name).is_file():
-            catalogs.append(load(Path(name)))
-            continue
-        try:
-            catalogs.append(shipped_catalog(str(name)))
-        except CatalogError as error:
-            raise NoProblem(f"{option('catalog')}: {error}") from None
-    return tuple(catalogs)
+    try:
+        return catalogs_named(catalog or shipped or ("SCHOTT",))
+    except CatalogError as error:
+        raise NoProblem(f"{option('catalog')}: {error}") from None
 
 
-def pool_of(lens: Lens, catalogs: Sequence[Catalog]) -> Pool:
-    """Glasses of STATUSES whose range covers the wavelengths of the lens. Raises NoProblem where there is none."""
-    shortest, longest = float(lens.wavelengths.min()), float(lens.wavelengths.max())
-    span = lambda glass: glass.wavelength_range or (0.0, np.inf)  # noqa: E731
-    glasses = [
-        dataclasses.replace(glass, name=glass.listed_name or glass.name)
-        for catalog in catalogs
-        for glass in catalog.glasses.values()
-        if glass.status in STATUSES and span(glass)[0] <= shortest and longest <= span(glass)[1] and not is_air(glass)
-    ]
-    return Pool(glasses, lens.wavelengths)
+def pool_of(lens: Lens, catalogs: Sequence[Catalog], words: str | Sequence[str] = "") -> Pool:
+    """Glasses of a selection (`materials.selection`) whose range covers the wavelengths of the lens.
+
+    Raises NoProblem where there is none, and BadSelection.
+    """
+    listing = selected(words, catalogs=catalogs, wavelengths=lens.wavelengths)
+    if not listing.glasses:
+        raise NoProblem(f"no glass to choose: {listing.summary}. Change {option('glasses')} or {option('catalog')}")
+    return Pool(listing.glasses, lens.wavelengths, listing, is_specified=bool(words))
+
+
+def _is_among(glass: Glass, glasses: Sequence[Glass]) -> bool:
+    keys = {(other.listed_name or other.name, other.catalog) for other in glasses}
+    return bool(glass.catalog) and (glass.listed_name or glass.name, glass.catalog) in keys
 
 
 def charge(glass: Glass) -> float:
     """Factor on the merit with a glass: above 1 if its maker does not prefer it, or if it is expensive."""
-    price = next((numbers[0] for keyword, numbers in glass.records if keyword == "OD" and numbers), 0.0)
-    return STATUSES.get(glass.status, max(STATUSES.values())) * max(price, 1.0) ** _PRICE
+    return (1.0 if glass.status == "preferred" else _NOT_PREFERRED) * max(glass.relative_price or 1.0, 1.0) ** _PRICE
 
 
 def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:
@@ -303,13 +309,15 @@ class Choice:
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
-        """The glasses and their numbers for every surface: the pool, and the glass of the surface, if of a catalog."""
+        """The glasses and their numbers for every surface: the pool, and the glass of the surface, if of a catalog and
+        if no selection is specified."""
         candidates = {}
         for k in self.surfaces:
-            glass_of_lens, names = self.model.lens.surfaces[k].glass, {(g.name, g.catalog) for g in self.pool.glasses}
+            glass_of_lens = self.model.lens.surfaces[k].glass
             new = (
                 bool(glass_of_lens.catalog)
-                and (glass_of_lens.listed_name or glass_of_lens.name, glass_of_lens.catalog) not in names
+                and not self.pool.is_specified
+                and not _is_among(glass_of_lens, self.pool.glasses)
             )
             glasses = (*self.pool.glasses, glass_of_lens) if new else self.pool.glasses
             numbers = [self.pool.numbers, self.pool.numbers_of(glass_of_lens)[None]] if new else [self.pool.numbers]
@@ -330,7 +338,7 @@ class Choice:
         self.steps.append(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
-            known = all(glass.catalog for glass in glasses_of_lens.values())
+            known = all(_is_among(glass, self.candidates[k][0]) for k, glass in glasses_of_lens.items())
             if known and time.monotonic() > self.until:
                 return first
             snapped = self.snapped(first, known=known)
@@ -353,7 +361,7 @@ class Choice:
     def snapped(self, design: DescendedDesign, *, known: bool) -> DescendedDesign:
         """The design with model glasses, which glasses of the catalogs then replace one by one.
 
-        known: whether the glasses of the design are of catalogs; then it is returned where no time is left.
+        known: whether the glasses of the design are candidates; then it is returned where no time is left.
         """
         first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
         design = self.descend(Design(design.x, model), self.surfaces, self.cycles)

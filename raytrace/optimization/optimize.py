@@ -69,6 +69,7 @@ def optimize(
     seconds: float | None = None,
     paths: int = 1,
     catalog: Sequence[str | PathLike] = (),
+    glasses: str | Sequence[str] = "",
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
@@ -92,7 +93,8 @@ def optimize(
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit.
     cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
-    (`optimization.glass_choice`). log: a file
+    (`optimization.glass_choice`); glasses: a selection of them, as "preferred price<=3 transmittance:0.4>=0.98", by
+    default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own. log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
     lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
     rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
@@ -114,7 +116,8 @@ def optimize(
         if log is not None and path is not None and os.path.realpath(log) == os.path.realpath(path):
             raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     warn_of_filling(lens, field_points(None, like=lens))
-    model, glasses = without_glass(design_variables(lens, vary), vary)
+    model, chosen = without_glass(design_variables(lens, vary), vary)
+    pool = pool_of(lens, catalogs_of(lens, catalog), glasses) if chosen else None
     names = tuple(variable.name for variable in model.variables)
     if not names:
         raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
@@ -128,7 +131,7 @@ def optimize(
     def about(**of_merit: object) -> dict[str, object]:
         """All that a checkpoint depends on."""
         variables = {"variables": list(names), "solves": digest(repr(model.solves)), "paths": paths}
-        variables |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
+        variables |= {"glasses that vary": list(chosen), "bounds": plain([lower.tolist(), upper.tolist()])}
         return {**identity(lens), **variables, **of_merit}
 
     def stored(about: Mapping[str, object]) -> Stored:
@@ -148,8 +151,8 @@ def optimize(
         loss, first, restarts, quantity, merit = merit, None, 0, None, None
     else:
         quantity = quantity_of(of)
-    if loss is not None and (glasses or as_built is not None):
-        given = option("vary", "glass") if glasses else option("as_built")
+    if loss is not None and (chosen or as_built is not None):
+        given = option("vary", "glass") if chosen else option("as_built")
         raise NoProblem(f"{given} goes with a merit of rows, not with a function: leave it out")
     rows, held = specified(lens, merit if loss is None else first or "spot", hold)
     conditions, of_rows = conditions_in_unit(lens, held, rows.unit), rows.options
@@ -163,8 +166,8 @@ def optimize(
         dependencies |= {"loss": name, "of": repr(quantity), "object distances": plain(object_distances)}
         dependencies |= {"restarts": restarts, "first": first is not None}
     resumed = stored(dependencies)
-    if set(resumed.glasses) - set(glasses):
-        raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*glasses]}")
+    if set(resumed.glasses) - set(chosen):
+        raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*chosen]}")
     start, opening = np.clip(resumed.x, lower, upper), Opened(resumed.x)
     choice: Choice | None = None
     ends = {name: (float(least), float(most)) for name, least, most in zip(names, lower, upper, strict=True)}
@@ -216,11 +219,10 @@ def optimize(
         seconds_of_end = min(seconds_of_end, time.monotonic() - evaluating)  # the first evaluation takes longer
     until -= seconds_of_end  # the result is evaluated once more
     with observer(dependencies, lens_at, resumed.descent) as seen:
-        if glasses and not opening.interrupted:
-            pool = pool_of(lens, catalogs_of(lens, catalog))
+        if pool is not None and not opening.interrupted:
             keep = None if seen.checkpoint is None else seen.checkpoint.write_glasses
             choice = Choice(
-                model, glasses, pool, rows.rows, conditions, (lower, upper), cycles=cycles, until=until, keep=keep,
+                model, chosen, pool, rows.rows, conditions, (lower, upper), cycles=cycles, until=until, keep=keep,
                 as_built=term, **of_rows,
             )  # fmt: skip
             start, problem = choice.run(start, resumed).x, choice.problem(choice.best.glasses, ())
@@ -243,7 +245,7 @@ def optimize(
         cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
         evaluations=descent.evaluations + (choice.evaluations if choice else 0),
         stopped="interrupted" if opening.interrupted else descent.stopped, seconds=time.monotonic() - started,
-        glasses=tuple(choice.steps) if choice else (), conditions=results,
+        glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing, conditions=results,
         as_built=None if term is None else AsBuiltChange.of(term, lens, end),
     )  # fmt: skip
     return _warned(result)

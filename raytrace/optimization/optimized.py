@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.io import write_lens
+from raytrace.materials.selection import GlassList, columns_of
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Columns, Result, Table, number, plain
 from raytrace.optimization.attained import Attained, table_of
@@ -43,6 +44,14 @@ def _glass_table(steps: Sequence[GlassStep]) -> Table:
     return Table(columns, [""])
 
 
+def _chosen_table(lens: Lens, steps: Sequence[GlassStep], listing: GlassList | None) -> Table:
+    """The glasses behind the surfaces where they were chosen, with their status and price."""
+    surfaces = sorted({step.surface for step in steps if step.surface})
+    glasses = [lens.surfaces[k].glass for k in surfaces]
+    head = [] if listing is None else [f"glasses to choose from: {listing.summary}", ""]
+    return Table({Column("surface"): surfaces, **columns_of(glasses)} if glasses else {}, ["", *head])
+
+
 @value
 class AsBuiltChange:
     """RMS spot radius in mm, before and after: expected of the lens as built (the root of the mean square), and of the
@@ -73,9 +82,10 @@ class Optimized(Result):
     contributions_before, contributions: (R,) of each to the square of the merit, of sum 1. history: (cycles, 5) merit,
     largest violation of a condition, step, damping and seconds of every cycle of the last descent. cycles, evaluations,
     seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
-    glasses were chosen. conditions: targets and values reached of conditions and boundaries. as_built: spots of the
-    lens as built, if it is a term of the merit, which then includes it. loss: the way of a loss, in the place of rows.
-    between: spots between fields, wavelengths or rays that are more than 1.5 times those beside them.
+    glasses were chosen; chosen_from: the glasses that could be chosen. conditions: targets and values reached of
+    conditions and boundaries. as_built: spots of the lens as built, if it is a term of the merit, which then includes
+    it. loss: the way of a loss, in the place of rows. between: spots between fields, wavelengths or rays that are more
+    than 1.5 times those beside them.
     """
 
     lens: Lens
@@ -96,6 +106,7 @@ class Optimized(Result):
     seconds: float
     stopped: str
     glasses: tuple[GlassStep, ...] = ()
+    chosen_from: GlassList | None = None
     conditions: tuple[Attained, ...] = ()
     as_built: AsBuiltChange | None = None
     loss: LossReport | None = None
@@ -172,6 +183,7 @@ class Optimized(Result):
                     for i in self.rows
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
+                **({"chosen_from": self.chosen_from.summary} if self.chosen_from else {}),
                 **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
                 **({"loss": dataclasses.asdict(self.loss)} if self.loss else {}),
                 "conditions": [condition.document() for condition in self.conditions],
@@ -201,7 +213,9 @@ class Optimized(Result):
         conditions = table_of(self.conditions)
         rows = self._largest_rows()
         rows = rows._replace(notes=[*rows.notes, *(["", *conditions] if conditions else [])])
-        glasses = [_glass_table(self.glasses)] if self.glasses else []
+        glasses = []
+        if self.glasses:
+            glasses = [_glass_table(self.glasses), _chosen_table(self.lens, self.glasses, self.chosen_from)]
         return [Table(variables, head), *glasses, *([self._lengths()] if self.has_configurations else []), rows]
 
     def _unsharp_start(self) -> list[str]:
