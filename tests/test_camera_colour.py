@@ -532,7 +532,8 @@ def command(folder, pictures, *more):
     words = (
         f"codesign cooke_triplet --sensor 24x16 --pixel 0.02 --size 11 --vary thickness sensor curvature --hold efl "
         f"buildable --optimizer adam --preset unet --depth 1 --width 4 --patch 16 --batch 4 --crops 4 --epochs 3 "
-        f"--noise 0.02 --near 8000 --far 40000 --focus-distance 13000 --precision float32 --data {pictures} -o {folder} --json"
+        f"--noise 0.02 --near 8000 --far 40000 --focus-distance 13000 --precision float32 --data {pictures} "
+        f"-o {folder} --json"
     ).split()
     return [*more, "-m", "raytrace", *words]
 
