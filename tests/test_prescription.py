@@ -49,6 +49,7 @@ def test_every_type_has_its_entries_in_the_document(name):
         "glass",
         "indices",
         "semi_diameter",
+        "semi_diameter_is_fixed",
         "comment",
     }
     found = rt.info(lens).document()["surfaces"]

@@ -18,7 +18,15 @@ _POWERS = (-6, -3, -2, 2, 3, 6)  # of ten, between units: mm and µm or m, parts
 _DIGITS = 4  # a printed number with fewer may agree with another one by chance
 _UNITS_UNPRINTED = ("evaluate", "info", "trace")  # units of rows by operand; mm and degrees of a prescription, of CSV
 #: Rays that `spot` saves as CSV, counts of keywords, and numbers each in the unit of its row or its criterion.
-_WITHOUT_LENGTHS = {"Arrivals", "ImportReport", "Jacobian", "MeritsOfBatch", "ToleranceTable", "ToleranceAnalysis"}
+_WITHOUT_LENGTHS = {
+    "Arrivals",
+    "GlassList",
+    "ImportReport",
+    "Jacobian",
+    "MeritsOfBatch",
+    "ToleranceTable",
+    "ToleranceAnalysis",
+}
 
 
 #: Results of seconds, and their types.

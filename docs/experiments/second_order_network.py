@@ -218,10 +218,15 @@ def table() -> None:
               f"{row['network_steps']} steps, {row['patches']} pictures")  # fmt: skip
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
+    """The options of this script."""
     parser.add_argument("--data", metavar="DIR", help="folder of pictures; four fifths train, the others test")
     parser.add_argument("--table", action="store_true", help="print the table alone")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     asked = parser.parse_args()
     if asked.table:
         table()

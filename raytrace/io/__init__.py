@@ -286,8 +286,8 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
 
     Glasses with index errors are written as melts into a glass catalog beside a .zmx file or a table, as
-    worst-melts.agf of worst.zmx, which readers find there (`io.melts`). Automatic semi-diameters are written as the
-    rays give them (`Lens.with_semi_diameters`), and marked as automatic.
+    worst-melts.agf of worst.zmx, which readers find there (`io.melts`). Semi-diameters are written as the lens
+    stores them; `Lens.with_semi_diameters` stores those that the rays give.
     catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
     cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
     and other data that the file does not bring back.
@@ -295,7 +295,6 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     path, place = Path(path), Place(str(path))
     try:
         check_unit(lens.wavelengths, believed=lens.wavelengths)  # refuses wavelengths that are not above 0
-        lens = lens.with_semi_diameters()
     except ValueError as error:
         raise LensFileError(str(error), place) from error
     form = _format(path, WRITTEN)

@@ -23,7 +23,6 @@ def to_frame(lens: Lens, *, catalogs: Sequence[Path] = ()) -> pd.DataFrame:
     The system (aperture, fields, wavelengths, …) is in `frame.attrs["system"]`, a list of (key, value) as in the header
     of a table file; `lens_from_frame` reads it back, number for number.
     """
-    lens = lens.with_semi_diameters()
     columns = rows(lens, _PLACE.file)
     frame = pd.DataFrame({name: _column(name, cells) for name, cells in columns.items() if name != "surface"})
     frame.index = pd.RangeIndex(len(frame), name="surface")
