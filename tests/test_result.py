@@ -20,6 +20,7 @@ _UNITS_UNPRINTED = ("evaluate", "info", "trace")  # units of rows by operand; mm
 #: Rays that `spot` saves as CSV, counts of keywords, and numbers each in the unit of its row or its criterion.
 _WITHOUT_LENGTHS = {
     "Arrivals",
+    "Drawings",
     "GlassList",
     "ImportReport",
     "Jacobian",
@@ -208,6 +209,8 @@ def test_every_table_is_compared():
 
     assert callable(rt.tolerance)  # its results are loaded with it
     assert callable(rt.jacobian)
+    assert callable(rt.draw)
+    assert callable(rt.glasses)
     known = {type(computed(name)).__name__ for name in results() if name not in DEAR} | {*DEAR.values()}
     tables = {kind.__name__ for kind in below(Result) - {Result} if "columns" in vars(kind)}
     assert tables == known | _WITHOUT_LENGTHS
