@@ -33,6 +33,7 @@ from raytrace.optimization.operands.boundaries import AT_RIM, BOUNDARIES
 from raytrace.optimization.operands.operand import Line
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.variables import BadHold, DesignVariables, constraint_words, has_power, split_constraint
+from raytrace.system.dimensions import ARGUMENTS
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.parameter_paths import sensor
@@ -434,16 +435,11 @@ def _check_surfaces(lens: Lens, condition: Condition, k: int) -> None:
                 )
 
 
-#: Integers of rows that number surfaces.
-_SURFACES = ("surface", "place", "met surface", "contribution")
-
-
 def surface_arguments(row: Row) -> tuple[bool, bool]:
-    """Which of the two integers of a row are numbers of surfaces."""
-    if row.operand in BOUNDARIES:
-        return True, row.operand[:2] in ("MN", "MX")
-    first, second = OPERANDS[row.operand].takes if row.operand in OPERANDS else ("", "")
-    return first in _SURFACES, second in _SURFACES
+    """Which of the two integers of a row are numbers of surfaces or gaps."""
+    first, second = ARGUMENTS.get(row.operand, ("", "")) if isinstance(row.operand, str) else ("", "")
+    is_numbered = first in ("surface", "gap", "contribution")
+    return is_numbered, is_numbered and bool(second)
 
 
 def _name(lens: Lens, condition: Condition, k: int) -> str:
