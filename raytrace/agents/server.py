@@ -1,6 +1,6 @@
 """The MCP server: lists the tools, and has a worker process run each call. Loads no torch.
 
-A cancelled call, also that of a client that left, interrupts its worker, which may write what it has so far, as after
+A cancelled call, or a call whose client has left, interrupts its worker, which may write what it has so far, as after
 Ctrl-C, and ends it after a few seconds.
 """
 

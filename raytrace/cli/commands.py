@@ -673,7 +673,7 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         "Limits, in quotes: price<=3 (relative to the maker's BK7), density<=4 (g/cm³), expansion<=9 (1e-6/K), "
         "nd>=1.7, vd<=40, transmittance:0.4>=0.98 (internal, of 10 mm at 0.4 µm), and classes of resistance climate "
         "stain acid alkali phosphate, as acid<=2. A glass whose catalog does not list a figure does not meet its "
-        "limit: the shipped catalogs list no resistance, those of glass makers (.agf) do.",
+        "limit: the shipped catalogs list no resistance, the catalogs of glass makers (.agf) do.",
         """
         --catalog SCHOTT
         preferred 'price<=2' 'transmittance:0.4>=0.98' --catalog SCHOTT --catalog OHARA
