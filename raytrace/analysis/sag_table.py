@@ -2,7 +2,7 @@
 
     s(r) = c r²/(1 + w),  w = √(1 - c² r²);  ∂s/∂c = r²/(w (1 + w)),  ∂²s/∂c² = c r⁴ (1 + 2w)/(w³ (1 + w)²)
 
-BEST_FIT lists the definitions of the best-fit sphere. A departure is the sag of the surface minus the sag of the sphere.
+BEST_FIT lists the definitions of the best-fit sphere. A departure is the sag of the surface minus the sphere's sag.
 """
 
 import dataclasses
