@@ -127,6 +127,7 @@ PUBLIC = {
     "Psf": "psf_models",
     "Wave": "psf_models",
     "compare": "analysis.compare",
+    "compare_models": "analysis.compare_models",
     "distortion": "analysis.chief",
     "distortion_grid": "analysis.grid",
     "encircled_energy": "analysis.encircled",
@@ -149,6 +150,7 @@ PUBLIC = {
     "view": "viewer.widget",
     # drawings and solids
     "draw": "workshop.sheets",
+    "report": "workshop.report",
     # waves behind thin elements
     "as_pixels": "wave_optics.fabrication",
     "as_rings": "wave_optics.fabrication",
@@ -208,6 +210,7 @@ ERRORS = {
     "BadParameter": "agents.tools",
     "BadPrescription": "system.prescription",
     "BadRow": "optimization.operands.operand",
+    "BadReport": "workshop.report",
     "BadSearch": "optimization.search_tasks",
     "BadSelection": "materials.selection",
     "BadSettings": "cli.settings",
@@ -232,6 +235,7 @@ ERRORS = {
     "GoalMissed": "tolerancing.analysis",
     "HeightMapError": "wave_optics.height_maps",
     "ImplausibleWavelength": "materials.glass",
+    "Incomparable": "analysis.compare",
     "Incomplete": "analysis.setting",
     "InvalidIndex": "materials.glass",
     "LeftAsItWas": "edit.choice",
@@ -291,8 +295,10 @@ ERRORS = {
 #: The names that are typed: lenses and their files, the functions that commands run, and what a camera is made of. All
 #: others are names of their packages, `rt.imaging.blur`.
 TOP = (
-    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "view", "glass"),
-    *("glasses", "to", "trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront", "compare"),
+    *("Lens", "lens", "read_lens", "write_lens", "convert", "check", "info", "layout", "draw", "report"),
+    *("view", "glass"),
+    *("glasses", "to", "trace", "base_ray", "spot", "first_order", "focus", "psf", "mtf", "wavefront"),
+    *("compare", "compare_models"),
     "seidel",
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),

@@ -22,7 +22,9 @@ from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
 from raytrace.analysis.chromatic import chromatic_focal_shift as chromatic_focal_shift
+from raytrace.analysis.compare import Incomparable as Incomparable
 from raytrace.analysis.compare import compare as compare
+from raytrace.analysis.compare_models import compare_models as compare_models
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan
@@ -156,6 +158,8 @@ from raytrace.words import RaytraceError as RaytraceError
 from raytrace.words import RaytraceWarning as RaytraceWarning
 from raytrace.workshop.indications import BadIndication as BadIndication
 from raytrace.workshop.parts import NoSolid as NoSolid
+from raytrace.workshop.report import BadReport as BadReport
+from raytrace.workshop.report import report as report
 from raytrace.workshop.sheets import draw as draw
 
 __version__: str

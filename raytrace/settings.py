@@ -40,6 +40,21 @@ MODELS = ("paraxial", "fourier", "gaussian", "drt")
 GRADES = ("commercial", "precision", "high")
 #: Suffixes of drawings: sheets, profiles, solids, and the table of parts.
 DRAWINGS = (".pdf", ".svg", ".png", ".dxf", ".step", ".stp", ".csv", ".json")
+#: Suffixes of reports.
+REPORTS = (".pdf", ".html", ".htm", ".json")
+#: Sections of a report in their order, and those that are in it on request alone.
+SECTIONS = (
+    *("first-order", "prescription", "layout", "spots", "fans", "wavefront", "mtf", "encircled-energy"),
+    *("field-curves", "distortion", "illumination", "seidel", "conditions", "tolerances", "as-built", "temperature"),
+    "drawings",
+)
+ON_REQUEST = ("encircled-energy", "seidel", "as-built", "temperature", "drawings")
+#: Analyses by which two lenses are compared, as of `analysis.compare`.
+COMPARED = (
+    *("layout", "spot", "ray-fan", "opd-fan", "wavefront", "mtf", "encircled-energy", "distortion", "field-curvature"),
+    *("lateral-colour", "relative-illumination", "rms-over-field", "longitudinal-aberration", "chromatic-focal-shift"),
+    *("seidel", "thermal"),
+)
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"
 

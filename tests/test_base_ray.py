@@ -224,7 +224,7 @@ def test_analyses_about_an_axis_name_the_surface_that_folds_it():
     lens = bends.folded(rt.read_lens("double_gauss"), 10, tilt_x=45.0)
     for refused in (
         rt.seidel, rt.longitudinal_aberration, lambda one: rt.psf(one, "paraxial"), lambda one: rt.psf(one, "fourier"),
-        lambda one: rt.compare(one),
+        lambda one: rt.compare_models(one),
     ):  # fmt: skip
         with pytest.raises(Bent, match=r"straight axis, .*surface 11 is tilted or decentred; .+"):
             refused(lens)

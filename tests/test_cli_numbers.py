@@ -65,7 +65,7 @@ def test_a_psf_without_light_is_a_dash_null_and_a_warning(run, model):
 NA = {"ENPD 12.5": "OBNA 0.1 0", "DISZ INFINITY": "DISZ 200"}
 
 
-@pytest.mark.parametrize("command", ["spot", "spot --rays 500", "focus --field 0", "compare"])
+@pytest.mark.parametrize("command", ["spot", "spot --rays 500", "focus --field 0", "compare-models"])
 def test_an_object_na_of_a_distant_object_is_reported_with_a_remedy(run, command):
     """An entrance pupil of 5 m in front of a lens of 12 mm."""
     text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
@@ -73,14 +73,14 @@ def test_an_object_na_of_a_distant_object_is_reported_with_a_remedy(run, command
         text = text.replace(old, new)
     Path("na.zmx").write_text(text, encoding="utf-8")
     name, *options = command.split()
-    distance = ["--focus-distance" if name == "compare" else "--object-distance", 25000]
+    distance = ["--focus-distance" if name == "compare-models" else "--object-distance", 25000]
     found = run(name, "na.zmx", *distance, *options)
     assert "all " in found.err
     assert "rays lost: missed surface 3" in found.err
     assert "the aperture is an object NA of 0.1, whose entrance pupil is" in found.err
     assert "F-number" in found.err
     assert "nan" not in found.out
-    held = run(name, "na.zmx", *distance, *options, "--epd", 12.5) if name != "compare" else None
+    held = run(name, "na.zmx", *distance, *options, "--epd", 12.5) if name != "compare-models" else None
     assert held is None or "lost" not in held.err
 
 

@@ -7,7 +7,7 @@ from bends import pose
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import raytrace as rt
-from raytrace.analysis.compare import abilities
+from raytrace.analysis.compare_models import abilities
 from raytrace.analysis.layout_3d import draw
 from raytrace.words import named, with_article
 
@@ -32,7 +32,7 @@ def test_analyses_over_fields_name_a_lens_without_fields(run, tmp_path, command)
         (["convert", "cylinder_pair", "OUT.csv"], "surface is toroidal, which this format does not hold"),
         (["convert", "hybrid_achromat", "OUT.csv"], "has a phase (a radial phase), which this format does not hold"),
         (["convert", "folded_relay", "OUT.csv"], "tilted or decentred, which this format does not hold; a .zmx file"),
-        (["compare", "folded_relay"], "ask for kernels of one model by `psf`"),
+        (["compare-models", "folded_relay"], "ask for kernels of one model by `psf`"),
     ],
 )  # fmt: skip
 def test_a_refusal_names_the_surface_and_the_alternatives(run, tmp_path, argv, said):

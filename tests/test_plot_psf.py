@@ -11,7 +11,7 @@ from page import outside
 from problems import number, own_fields
 
 from raytrace import read_lens
-from raytrace.analysis import compare
+from raytrace.analysis import compare_models as compare
 from raytrace.cli import main
 from raytrace.maths.sampling import grid
 from raytrace.plotting import style

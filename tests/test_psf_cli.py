@@ -115,7 +115,7 @@ def test_an_even_window_has_the_axis_between_its_pixels(tmp_path):
     ],
 )
 def test_comparisons_that_make_no_sense_are_refused_in_one_line(capsys, words, code, message):
-    assert main(["compare", LENS, *words]) == code
+    assert main(["compare-models", LENS, *words]) == code
     said = capsys.readouterr()
     assert said.out == ""
     assert message in said.err

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.analysis import compare
+from raytrace.analysis import compare_models as compare
 from raytrace.maths.result import Result
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
@@ -31,7 +31,7 @@ _WITHOUT_LENGTHS = {
 
 
 #: Results of seconds, and their types.
-DEAR = {"abilities": "Abilities", "compare": "Comparison"}
+DEAR = {"abilities": "Abilities", "compare_models": "Comparison"}
 
 
 def results() -> dict[str, tuple]:
@@ -68,7 +68,7 @@ def results() -> dict[str, tuple]:
         "spot": (lambda: rt.spot(double, rings=4, **colours), "centroid_y rms_radius_um geometric_radius_um"),
         "spot of many rays": (lambda: rt.spot(double, rays=1000), "centroid_y rms_radius_um geometric_radius_um"),
         "focus": (lambda: rt.focus(double, object_distances=[3000]), "sensor_distance rms_radius_um"),
-        "compare": (lambda: rt.compare(single, object_distances=[10e3, 20e3]), "object_distance sigma_um difference"),
+        "compare_models": (lambda: rt.compare_models(single, object_distances=[10e3, 20e3]), "object_distance sigma_um difference"),
         "abilities": (lambda: compare.abilities(single), "conic anisotropy"),
         "psf": (
             lambda: rt.psf(single, "fourier", tol=1e-2),

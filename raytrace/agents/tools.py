@@ -154,6 +154,8 @@ TOOLS = {
         Tool("optimize"),
         Tool("search"),
         Tool("tolerance"),
+        Tool("report"),
+        Tool("compare", pictured=True),
         Tool("convert"),
         Tool("glass"),
         Tool("glasses"),

@@ -1,362 +1,540 @@
-"""Comparison of PSF models: kernels over object distance, and the properties that each can represent."""
+"""Comparison of two lenses, such as one before and after an optimisation: every analysis in one table and one figure of
+one scale.
+
+The first lens sets the scene of both: fields, wavelengths, frequencies, radii. A new analysis is a row of COMPARED.
+"""
 
 import dataclasses
 import math
-import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide, safe_sqrt, value
-from raytrace.maths.result import Column, Result, Table, axis, number, numbers
-from raytrace.maths.sampling import Grid, grid
-from raytrace.plotting.style import Figure, array, styled
-from raytrace.psf_models.figures import brightness, panels, window, worded
-from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
-from raytrace.psf_models.result import Psf
-from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths
-from raytrace.tracing.focus import NoImage, focused, real_image_distance
-from raytrace.tracing.paraxial import first_order, largest_field
-from raytrace.tracing.trace import need_axis
-from raytrace.words import option
-
-STARTS = ("paraxial", "rms")
-DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
-
-_ROWS = sorted(MODELS.values(), key=lambda model: model.row)  # the last one is the reference of the others
-_TOLERANCE = 0.01  # of abilities: the counting noise of a few rays would pass for aberrations and for rings
-_CONIC = 0.2  # by how much the conic of the most curved surface grows
-_SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first dark ring is searched
-_AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
-
-
-#: Properties of each model, and the whole numbers among them.
-_SHOWN = (
-    Column("conic", "", ".4f", "Δ conic"),
-    Column("anisotropy", "", ".4f", "σ long/short"),
-    Column("asymmetry", "", ".4f"),
-    Column("dark_ring", "", ".4f", "dark ring/Airy"),
-    Column("parameters", "", ".0f"),
-    Column("rays", "", ".0f"),
+from raytrace.analysis.chief import distortion, field_curvature, lateral_colour
+from raytrace.analysis.chromatic import chromatic_focal_shift
+from raytrace.analysis.encircled import encircled_energy
+from raytrace.analysis.fans import opd_fan, ray_fan
+from raytrace.analysis.illumination import relative_illumination
+from raytrace.analysis.layout import draw_layout, layout, on_one_scale
+from raytrace.analysis.longitudinal import longitudinal_aberration
+from raytrace.analysis.mtf import frequency_range, mtf
+from raytrace.analysis.panels import DASHES, Dash, field_labels, field_name, ruled
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.rms import rms_over_field
+from raytrace.analysis.seidel import seidel
+from raytrace.analysis.setting import Numbers, Points, primary_wavelength
+from raytrace.analysis.spot_diagram import (
+    Spots,
+    airy_radius,
+    draw_spot,
+    panel_size,
+    spot,
+    wavelength_handles,
 )
-_WHOLE = ("parameters", "rays")
+from raytrace.analysis.thermal import thermal
+from raytrace.analysis.wavefronts import WavefrontMap, diverging, wavefront
+from raytrace.io import as_lens
+from raytrace.maths.numerics import detached, value
+from raytrace.maths.result import Column, Result, Table, flat
+from raytrace.plotting.style import GREY, Axes, Figure, array, fill, legend_entry, new_figure, number_text, styled
+from raytrace.system.lens import Lens, field_points, with_wavelengths
+from raytrace.tracing.lens_report import FIRST_ORDER_LINES, Info
+from raytrace.words import RaytraceError, did_you_mean, option
+
+COLOURS, WIDTHS = ("#0072B2", "#D55E00"), (2.2, 1.1)  # of the first and the second lens, also where they coincide
+_HEADS = ("field_x", "field_y", "wavelength", "frequency", "radius", "pupil", "temperature", "quantity")
+_NO_VALUES = ("tangential_limit", "sagittal_limit", "rays", "projected_solid_angle", "noll", "coefficient")
+_ACROSS = 3  # panels in a row
+_FREQUENCIES = 41
+
+
+class Incomparable(RaytraceError, ValueError):
+    """Two lenses, or an analysis, that cannot be compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """How the curves of an analysis are drawn.
+
+    x: the column of the abscissa; curves: columns and their labels; factor: of the curves, x_factor: of the abscissa;
+    panels: a panel for each of these, "field", "wavelength" or "curve"; the others have a dash each; upright: the
+    abscissa is drawn upwards; limits: of the curves; is_shared: whether all panels have one scale of the curves.
+    """
+
+    x: str
+    x_name: str
+    name: str
+    curves: Mapping[str, str]
+    panels: tuple[str, ...] = ()
+    factor: float = 1.0
+    x_factor: float = 1.0
+    upright: bool = False
+    limits: tuple[float | None, float | None] = (None, None)
+    is_shared: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """An analysis of both lenses: the function; the options of the second call by the first result; its curves, or the
+    function that draws its figure; summary: whether the table is the summary of the results;
+    at_fields: whether it takes fields."""
+
+    make: Callable[..., Result]
+    alike: Callable[[Any], dict[str, Any]]
+    draws: Curves | Callable[["LensComparison"], Figure]
+    summary: bool = False
+    at_fields: bool = False
 
 
 @value
-class Abilities(Result):
-    """The properties that each model can represent, of the object in focus: one number (M,) for each model.
+class LensComparison(Result):
+    """An analysis of two lenses and its differences: columns end in _1, _2 and _change, second less first.
 
-    conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
-    anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
-        asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
-        light (off axis).
-    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan without a minimum (diffraction).
-    parameters: number of curvatures, conics and thicknesses by which the kernel has a derivative other than 0.
-    rays: traced for one kernel on the axis.
+    first, second: results of the function of the analysis at the same fields, wavelengths and abscissae; names: of the
+    lenses; of layouts the table has first-order data.
     """
 
-    COLUMNS = (Column("model", form="<"), *_SHOWN)
+    lens: Lens
+    other: Lens
+    analysis: str
+    names: tuple[str, str]
+    first: Result
+    second: Result
 
-    conic: Tensor
-    anisotropy: Tensor
-    asymmetry: Tensor
-    dark_ring: Tensor
-    parameters: Tensor
-    rays: Tensor
-    models: tuple[str, ...]
+    @property
+    def COLUMNS(self) -> Sequence[Column]:  # type: ignore[override]
+        columns = []
+        for name in self._values():
+            of = self.first.column(name)
+            title, _, second = (of.heading or name.replace("_", " ")).partition("\n")
+            title = "" if name == "value" else f"{title} {second}".strip()
+            form = of.form.removeprefix("+")
+            ends = (("_1", "A"), ("_2", "B"), ("_change", "B − A"))
+            columns += [Column(name + end, of.unit, form, f"{title if k == 0 else ' '}\n{label}")
+                        for k, (end, label) in enumerate(ends)]  # fmt: skip
+        return [*columns, Column("quantity", form="<"), Column("unit", form="<", heading="unit or definition")]
+
+    def _tables_of_both(self) -> list[dict[str, Tensor]]:
+        if self.analysis == "layout":
+            return [_first_order(lens) for lens in (self.lens, self.other)]
+        take = "summary" if COMPARED[self.analysis].summary else "columns"
+        return [getattr(result, take)() for result in (self.first, self.second)]
+
+    def _values(self) -> list[str]:
+        return [name for name in self._tables_of_both()[0] if name not in _HEADS and name not in _NO_VALUES]
 
     def columns(self) -> dict[str, Tensor]:
-        model = torch.arange(len(self.models), device=self.conic.device)
-        return {"model": model, **{column.name: getattr(self, column.name) for column in _SHOWN}}
+        first, second = self._tables_of_both()
+        table = {name: column for name, column in first.items() if name in _HEADS}
+        for name in self._values():
+            one, other = first[name], second[name]
+            table |= {f"{name}_1": one, f"{name}_2": other, f"{name}_change": other - one}
+        return table | ({"unit": table["quantity"]} if "quantity" in table else {})
 
-    def words(self) -> dict:
-        return {"model": self.models}
+    def column(self, name: str) -> Column:
+        own = next((column for column in self.COLUMNS if column.name == name), None)
+        return own or self.first.column(name)
 
-    def of(self, m: int) -> dict[str, float | int | None]:
-        """The answers of one model."""
-        return {name: (int if name in _WHOLE else number)(getattr(self, name)[m]) for name, *_ in _SHOWN}
-
-    def tables(self) -> list[Table]:
-        return [Table(self.columns(), ["properties that each model can represent: see `raytrace compare --help`"])]
-
-
-@value
-class Comparison(Result):
-    """Kernels of every model on the axis, over object distance, on one sensor.
-
-    psfs: of each model, kernels (D, 1, rows, columns); models: their names.
-    object_distances: (D,) mm; sensor_distance: () mm from the last surface; wavelength: () µm.
-    abilities: the properties that each model can represent, or None.
-    """
-
-    psfs: tuple[Psf, ...]
-    object_distances: Tensor
-    sensor_distance: Tensor
-    wavelength: Tensor
-    models: tuple[str, ...]
-    abilities: Abilities | None = None
-
-    @property
-    def sigma(self) -> Tensor:
-        """σ (M, D) mm of each kernel along x or y, before pixels: √((σ_x² + σ_y²)/2).
-
-        Of "Fourier" and "wave" of the light inside the window, see `Psf.covariance`.
-        """
-        covariance = torch.stack([psfs.covariance[..., 0] for psfs in self.psfs])
-        return safe_sqrt(0.5 * (covariance[:, 0] + covariance[:, 2]))
-
-    @property
-    def difference(self) -> Tensor:
-        """Relative L1 difference (M, D) of each kernel from that of the last model."""
-        kernels = torch.stack([psfs.kernel[:, 0] for psfs in self.psfs])
-        return safe_divide((kernels - kernels[-1]).abs().sum((-2, -1)), kernels[-1].sum((-2, -1)))
-
-    @property
-    def error(self) -> Tensor:
-        """Estimated error (M, D) of each kernel against its own model's limit, see `Psf.error`."""
-        return torch.stack([psfs.error[:, 0] for psfs in self.psfs])
-
-    def columns(self) -> dict[str, Tensor]:
+    def words(self) -> dict[str, Sequence[str]]:
+        if self.analysis != "layout":
+            return {}
         return {
-            "model": axis(torch.arange(len(self.models), device=self.object_distances.device), 0, 2),
-            "object_distance": axis(self.object_distances, 1, 2),
-            "sigma_um": 1e3 * self.sigma,
-            "energy": torch.stack([psfs.energy[:, 0] for psfs in self.psfs]),
-            "difference": self.difference,
-            "error": self.error,
-            "rays": axis(self.object_distances.new_tensor([psfs.rays for psfs in self.psfs]), 0, 2),
+            "quantity": [words for words, *_ in FIRST_ORDER_LINES],
+            "unit": [unit for *_, unit in FIRST_ORDER_LINES],
         }
 
-    def words(self) -> dict:
-        return {"model": self.models}
-
-    @property
-    def sensor(self) -> str:
-        """The sensor distance and the wavelength, in words."""
-        return f"one sensor at {float(self.sensor_distance):.7f} mm, {float(self.wavelength):g} µm"
+    def units(self) -> dict[str, str]:
+        return {name: unit for name in self.columns() if (unit := self.column(name).unit)}
 
     def document(self) -> dict:
-        """Every model by its name: its properties, differences and kernels."""
-        models = {
-            name: {
-                **({} if self.abilities is None else self.abilities.of(m)),
-                "difference": numbers(self.difference[m]),
-                "results": self.psfs[m].document()["results"],
-            }
-            for m, name in enumerate(self.models)
+        return {
+            "analysis": self.analysis,
+            "names": list(self.names),
+            "units": self.units(),
+            "first": self.first.document(),
+            "second": self.second.document(),
+            **Result.document(self),
         }
-        place = {"sensor_distance": number(self.sensor_distance), "wavelength": number(self.wavelength)}
-        return {**place, "models": models}
 
     def tables(self) -> list[Table]:
-        """A row for each model, and for each object distance its σ, difference and error."""
-        pixels = self.psfs[-1].grid
-        size = f"{pixels.columns} × {pixels.rows} pixels of {1000 * float(pixels.pitch):g} µm"
-        title = [
-            f"{self.sensor}; on the axis, {size}",
-            f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {self.models[-1]}, "
-            "estimated error of the kernel (Gaussian DRT: of σ), for objects at",
-        ]
-        columns: dict[str | Column, Tensor | Sequence] = {Column("model", form="<"): self.models}
-        table = self.columns()
-        for k, distance in enumerate(self.object_distances.tolist()):
-            columns |= {
-                Column(f"sigma {k}", "µm", ".3f", f"{distance:g} mm\nσ"): table["sigma_um"][:, k],
-                Column(f"difference {k}", "", ".3f", " \nΔ"): table["difference"][:, k],
-                Column(f"error {k}", "", ".1e", " \nerror"): table["error"][:, k],
-            }
-        return [Table(columns, title, [] if self.abilities is None else [str(self.abilities)])]
+        title = [f"{self.analysis.replace('_', ' ')}: A {self.names[0]}, B {self.names[1]}"]
+        if not torch.equal(self.lens.wavelengths, self.other.wavelengths):
+            title.append("wavelengths of both: those of A")
+        columns: dict[str, Tensor] = self.columns()
+        every = getattr(self.first, "EVERY", 1)
+        tables = [Table(columns, title)]
+        if every > 1 and isinstance(self.first, Analysis):
+            tables = [self.first.thinned(columns, every)._replace(title=title)]
+        if isinstance(self.first, Spots) and isinstance(self.second, Spots) and len(self.first.lens.wavelengths) > 1:
+            radii = [1e3 * spots.whole.rms_radius for spots in (self.first, self.second)]
+            y = {Column("field_x", self.first.lens.fields.unit): self.first.fields[0]}
+            y |= {Column("field_y", self.first.lens.fields.unit): self.first.fields[1]}
+            whole: dict[Any, Tensor] = y if bool(self.first.fields[0].any()) else {k: y[k] for k in [*y][1:]}
+            for label, values in zip(("A", "B", "B − A"), (*radii, radii[1] - radii[0]), strict=True):
+                whole[Column(f"rms {label}", "µm", ".4f", f"{'RMS' if label == 'A' else ' '}\n{label}")] = values
+            tables.append(Table(whole, ["", "all wavelengths together"]))
+        return tables
 
     @styled
-    def draw(self, *, log: bool = False) -> Figure:
-        """Kernels over object distance (columns) and model (rows, with the number of its rays).
-
-        Below each kernel: its energy inside the window, and its relative L1 difference from the last row.
-        log: four decades of brightness below the peak.
-        """
-        kernels = [array(psfs.kernel)[:, 0] for psfs in self.psfs]
-        notes = [
-            [
-                f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if models is not kernels[-1] else "")
-                for k, d in zip(models, row, strict=True)
-            ]
-            for models, row in zip(kernels, array(self.difference), strict=True)
-        ]
-        labels = [
-            f"{name}\n" + (f"({psfs.rays} rays)" if psfs.rays else "")
-            for name, psfs in zip(self.models, self.psfs, strict=True)
-        ]
-        grid = self.psfs[-1].grid
-        pitch, distances = float(grid.pitch), self.object_distances.tolist()
-        half = 0.5 * pitch * grid.columns
-        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
-        title = ": ".join(filter(None, (self.psfs[-1].lens.name, self.sensor)))
-        return worded(
-            figure, title, [window(grid), brightness(log), f"Δ: relative L¹ difference from {self.models[-1]}"]
-        )
+    def draw(self) -> Figure:
+        """Both lenses in one figure of one scale: the first in blue, the second in orange, or one above the other."""
+        draws = COMPARED[self.analysis].draws
+        return _curves(self, draws) if isinstance(draws, Curves) else draws(self)
 
 
 def compare(
     lens: Lens,
+    other: Lens | str | PathLike,
+    analysis: str = "layout",
     *,
-    object_distances: Tensor | Sequence[float] = DISTANCES,
-    focus_distance: float = 25e3,
-    wavelengths: Sequence[float] = (0.53,),
-    start: Literal["paraxial", "rms"] = "paraxial",
-    pixel: float = PIXEL,
-    size: int = SIZE,
-) -> Comparison:
-    """The PSF models on the axis over object distances (D,) mm, and the properties that each can represent.
+    fields: Points = None,
+    wavelengths: Numbers = None,
+    frequencies: Numbers = None,
+    names: Sequence[str] | None = None,
+) -> LensComparison:
+    """An analysis of two lenses, such as before and after an optimisation, its differences and one figure of one scale.
 
-    start: sensor position, the "paraxial" image or the minimum "rms" spot radius on the axis; focus_distance: object in
-    focus, mm; wavelengths: µm, of which the first is taken; pixel: pitch, mm; size: pixels across the windows. Raises
-    NoImage for a distance of which the lens forms no real image.
+    analysis: a key of COMPARED: "layout" (with first-order data), "spot", "mtf", "ray_fan", "distortion" …; fields: y
+    or (x, y), by default those of the first lens, as are wavelengths (µm) with their weights; frequencies: of "mtf",
+    cycles/mm, by default to the higher of the resolutions of both lenses; names: of the lenses, by default A and B with
+    their titles. Raises Incomparable for an unknown analysis and for lenses with different kinds of fields.
     """
-    need_axis(lens, "the comparison of PSF models on the axis", "ask for kernels of one model by `psf`")
-    distances = torch.as_tensor(object_distances, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-    try:
-        lens = common_focus(lens, focus_distance, wavelength=wavelengths[0], start=start)
-        real_image_distance(lens, distances)
-    except NoImage as error:
-        length = float(first_order(lens).effective_focal_length)
-        raise NoImage(
-            f"{error}; its focal length is {length:.6g} mm, give {option('focus_distance')} and "
-            f"{option('object_distances')} beyond, or inf"
-        ) from error
-    pixels = grid(lens.wavelengths.new_tensor(pixel), size)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotConverged)  # the estimated errors are part of the result
-        kernels = side_by_side(lens, distances, pixels=pixels)
-        return dataclasses.replace(kernels, abilities=abilities(lens, pixels=pixels))
+    key = analysis.replace("-", "_")
+    if key not in COMPARED:
+        known = [name.replace("_", "-") for name in COMPARED]
+        meant = did_you_mean(analysis.replace("_", "-"), known)
+        listed = ", ".join(known)
+        raise Incomparable(f"{option('analysis', analysis)}: no such analysis{meant}; expected one of {listed}")
+    both = (lens, as_lens(other, "compare"))
+    lens, other = (detached(one if wavelengths is None else with_wavelengths(one, wavelengths)) for one in both)
+    if lens.fields.kind != other.fields.kind:
+        kinds = " and ".join(one.fields.kind.replace("_", " ") for one in (lens, other))
+        raise Incomparable(f"the fields of the lenses are of different kinds, {kinds}: they have no common field")
+    if frequencies is not None and key != "mtf":
+        raise Incomparable(f"{option('frequencies')} goes with {option('analysis', 'mtf')}")
+    titles = tuple(names) if names is not None else (lens.name or "Lens", other.name or "Lens")
+    if len(titles) != 2:
+        raise Incomparable(f"{option('names')}: {len(titles)} names; expected 2")
+    entry, alike = COMPARED[key], _in_scene(other, lens)
+    given = {} if fields is None or not entry.at_fields else {"fields": fields}
+    given |= {} if frequencies is None else {"frequencies": frequencies}
+    if key == "mtf" and frequencies is None:
+        points = field_points(fields, like=lens)
+        ranges = [frequency_range(one, points, _FREQUENCIES) for one in (lens, alike)]
+        given["frequencies"] = max(ranges, key=lambda row: float(row[-1]))
+    first = entry.make(lens, **given)
+    second = entry.make(alike, **entry.alike(first))
+    if key == "encircled_energy":
+        first, second = _to_common_radius(first, alike)
+    return LensComparison(lens, other, key, (titles[0], titles[1]), first, second)
 
 
-def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tensor, start: str = "paraxial") -> Lens:
-    """The lens at one wavelength (µm), focused at an object distance (mm, inf allowed), on the axis.
-
-    start: "paraxial", the paraxial image; "rms", the sensor of the least RMS spot. Raises ValueError for another start
-    and where the lens forms no real image of the object.
-    """
-    if start not in STARTS:
-        raise ValueError(f"start {start!r} is not known; expected {' or '.join(STARTS)}")
-    return focused(with_wavelengths(lens, [float(wavelength)]), focus_distance, on=start)
+def _in_scene(other: Lens, lens: Lens) -> Lens:
+    """A lens at the wavelengths of another, with their weights and its primary one."""
+    if torch.equal(other.wavelengths, lens.wavelengths):
+        weights = lens.wavelength_weights
+    else:
+        other, weights = with_wavelengths(other, lens.wavelengths), lens.wavelength_weights
+    return dataclasses.replace(other, wavelength_weights=weights, primary_wavelength=lens.primary_wavelength)
 
 
-def side_by_side(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = None) -> Comparison:
-    """Kernels of every model on the axis for objects at distances (D,) mm, sensor as it is.
+def _to_common_radius(first: Any, other: Lens) -> tuple[Result, Result]:
+    """Encircled energy of both lenses up to the larger of their default radii."""
+    alone = encircled_energy(other, fields=first.fields)
+    radii = max(first.radii, alone.radii, key=lambda row: float(row[-1]))
+    results = (encircled_energy(lens, radii, fields=first.fields) for lens in (first.lens, other))
+    one, two = (dataclasses.replace(result, marked=False) for result in results)
+    return one, two
 
-    pixels: about the axis, by default 21 × 21 of 5 µm.
-    """
-    return Comparison(
-        psfs=tuple(_psf(lens, m, object_distances=object_distances, grid=pixels, **m.compared) for m in _ROWS),
-        object_distances=object_distances,
-        sensor_distance=lens.surfaces[-2].thickness,
-        wavelength=lens.primary,
-        models=tuple(model.title for model in _ROWS),
+
+def _first_order(lens: Lens) -> dict[str, Tensor]:
+    document = Info(lens).document()
+    numbers = [document[name] for _, name, _ in FIRST_ORDER_LINES]
+    values = lens.wavelengths.new_tensor([math.nan if number is None else number for number in numbers])
+    return {"quantity": torch.arange(len(numbers)), "value": values}
+
+
+# -- figures
+
+
+def _curves(of: LensComparison, plot: Curves) -> Figure:
+    """The curves of both lenses: a panel for each of `plot.panels`, one colour a lens, dashes for the rest."""
+    results = [getattr(result, "drawn", lambda result=result: result)() for result in (of.first, of.second)]
+    tables = [flat({**result.columns(), **_summary(result)}) for result in results]
+    keys = {"field": ("field_x", "field_y"), "wavelength": ("wavelength",)}
+    dims = [dim for dim, names in keys.items() if names[0] in tables[0] and not (dim == "field" and plot.x == "field")]
+    if plot.x == "wavelength":
+        dims.remove("wavelength")
+    groups = {dim: _groups(tables[0], keys[dim]) for dim in dims} | {"curve": [(name,) for name in plot.curves]}
+    groups["curve"] = [(name,) for name in plot.curves if name in tables[0]]
+    shown = [dim for dim in plot.panels if len(groups.get(dim, [])) > 1] or ["curve"][: not plot.is_shared]
+    dashed = [dim for dim in groups if dim not in shown]
+    places = _product([groups[dim] for dim in shown])
+    if len(shown) == 2:
+        shape = len(groups[shown[0]]), len(groups[shown[1]])
+    else:
+        shape = -(-len(places) // _ACROSS), min(len(places), _ACROSS)
+    wide, tall = (5.6, 3.6) if shape == (1, 1) else (3.1, 2.35)
+    wide = min(wide, 9.3 / shape[1]) if shape[1] > 1 else max(wide, 5.0)
+    if plot.upright:
+        tall = max(tall, 3.4)
+    figure = new_figure(wide * shape[1] + 0.3, tall * shape[0] + 1.2)
+    grid = figure.subplots(*shape, squeeze=False, sharex=plot.is_shared or not plot.upright, sharey=plot.is_shared)
+    panels = list(grid.flat)
+    styles = _product([groups[dim] for dim in dashed])
+    labels = {"field": dict(zip(groups.get("field", []), _field_words(results[0], groups), strict=False))}
+    for panel, place in zip(panels, places, strict=False):
+        ruled(panel)
+        for k, style in enumerate(styles):
+            chosen = dict(zip([*shown, *dashed], [*place, *style], strict=True))
+            for table, colour, width in zip(tables, COLOURS, WIDTHS, strict=True):
+                x, y = _line(table, chosen, keys, plot)
+                look: dict[str, Any] = {"marker": "o", "markersize": 3} if len(x) <= 5 else {}
+                look |= {"color": colour, "linestyle": DASHES[k % len(DASHES)], "linewidth": width}
+                panel.plot(*((y, x) if plot.upright else (x, y)), **look)
+        title = [_word(dim, part, labels, plot) for dim, part in zip(shown, place, strict=True)]
+        if plot.is_shared:
+            panel.set_title(", ".join(title))
+        x_name = plot.x_name or field_name(of.first.lens)
+        axis_names = (plot.name if plot.is_shared else ", ".join(title), x_name)
+        x_label, y_label = axis_names if plot.upright else axis_names[::-1]
+        if plot.is_shared:
+            panel.label_outer()
+        bottom = panels.index(panel) + shape[1] >= len(places)
+        panel.set(xlabel=x_label if bottom or not plot.is_shared else "")
+        panel.set(ylabel=y_label if panel in grid[:, 0] or not plot.is_shared else "")
+        if bottom:
+            panel.tick_params(labelbottom=True)
+        (panel.axvline if plot.upright else panel.axhline)(0, color=GREY, linewidth=0.6)
+    for panel in panels[len(places) :]:
+        panel.axis("off")
+    extent = _line(tables[0], dict(zip([*shown, *dashed], [*places[0], *styles[0]], strict=True)), keys, plot)[0]
+    for panel in panels[: len(places)]:
+        (panel.set_ylim if plot.upright else panel.set_xlim)(np.nanmin(extent), np.nanmax(extent) or 1.0)
+        if plot.limits != (None, None):
+            panel.set_ylim(*plot.limits)
+        if shape[1] > 1:
+            panel.locator_params(axis="x", nbins=5)
+    words = [", ".join(_word(dim, part, labels, plot) for dim, part in zip(dashed, style, strict=True)
+                       if len(groups[dim]) > 1) for style in styles]  # fmt: skip
+    return _finished(figure, of, [*zip(words, DASHES * len(words), strict=False)] if len(styles) > 1 else [])
+
+
+def _summary(result: Any) -> dict[str, Tensor]:
+    """Columns of the summary over the field, of results that have one along the same fields."""
+    summary = getattr(result, "summary", dict)()
+    table = result.columns()
+    return {name: column[..., None] for name, column in summary.items() if name not in table and column.dim() == 1}
+
+
+def _groups(table: Mapping[str, np.ndarray], names: Sequence[str]) -> list[tuple]:
+    return [*dict.fromkeys(zip(*(table[name].tolist() for name in names), strict=True))]
+
+
+def _product(groups: Sequence[Sequence]) -> list[tuple]:
+    places: list[tuple] = [()]
+    for group in groups:
+        places = [(*place, part) for place in places for part in group]
+    return places
+
+
+def _line(
+    table: Mapping[str, np.ndarray], chosen: Mapping[str, tuple], keys: Mapping[str, Sequence[str]], plot: Curves
+) -> tuple[np.ndarray, np.ndarray]:
+    """Abscissae and values of the curve of a field, a wavelength and a column."""
+    (column,) = chosen["curve"]
+    rows = np.ones(len(table[column]), dtype=bool)
+    for dim, part in chosen.items():
+        for name, number in zip(keys.get(dim, ()), part, strict=False):
+            rows &= table[name] == number
+    x = np.hypot(table["field_x"], table["field_y"]) if plot.x == "field" else table[plot.x]
+    order = np.argsort(x[rows], kind="stable")
+    return plot.x_factor * x[rows][order], plot.factor * table[column][rows][order]
+
+
+def _field_words(result: Result, groups: Mapping[str, Sequence]) -> Sequence[str]:
+    return field_labels(result) if "field" in groups and isinstance(result, Analysis) else []
+
+
+def _word(dim: str, part: tuple, labels: Mapping[str, Mapping], plot: Curves) -> str:
+    if dim == "wavelength":
+        return f"{number_text(1e3 * part[0], 4)} nm"
+    if dim == "curve":
+        return plot.curves[part[0]]
+    return labels["field"].get(part, f"{part[1]:g}")
+
+
+def _finished(
+    figure: Figure, of: LensComparison, dashes: Sequence[tuple[str, Dash]] = (), *, coloured: bool = True
+) -> Figure:
+    """The figure with its title, and a legend of lenses and dashes."""
+    handles = (
+        [
+            legend_entry(f"{letter}: {name}", color=colour, linewidth=2)
+            for letter, name, colour in zip("AB", of.names, COLOURS, strict=True)
+        ]
+        if coloured
+        else []
     )
+    handles += [legend_entry(word, color="#404040", linestyle=dash) for word, dash in dashes]
+    if handles:
+        width = 12.0 * figure.get_figwidth()
+        columns = max(1, min(len(handles), int(width / (6 + max(len(str(h.get_label())) for h in handles)))))
+        figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    titles = {"rms_over_field": "RMS over the field", "mtf": "MTF", "opd_fan": "OPD fans", "ray_fan": "ray fans"}
+    titles["seidel"] = "sums of the Seidel aberrations"
+    figure.suptitle(titles.get(of.analysis, of.analysis.replace("_", " ")), fontweight="bold", fontsize=10)
+    return figure
 
 
-def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
-    """The properties that each model can represent, of a lens at one wavelength, its object and sensor distance.
-
-    pixels: about the axis, by default 21 × 21 of 5 µm.
-    """
-    changed, upright, rows = _with_conic(lens), largest_field(lens), []
-    for model in _ROWS:
-        work = {"tol": _TOLERANCE} if "model" in model.compared else model.compared
-        focused = _psf(lens, model, grid=pixels, **work)
-        away = _psf(lens, model, fields=upright, grid=_about_light(lens, upright, focused.grid, model), **work)
-        rows.append(
-            {
-                "conic": _relative(_psf(changed, model, grid=pixels, **work).kernel, focused.kernel),
-                "anisotropy": _anisotropy(away.ray_covariance[:, 0, 0]),
-                "asymmetry": _relative(away.kernel.flip(-2, -1), away.kernel),
-                "dark_ring": _dark_ring(lens, model, work),
-                "parameters": _parameters(lens, model, work),
-                "rays": model.compared["model"].rays if "model" in model.compared else focused.rays,
-            }
-        )
-    table = {key: lens.wavelengths.new_tensor([float(row[key]) for row in rows]) for key, *_ in _SHOWN}
-    return Abilities(**table, models=tuple(model.title for model in _ROWS))
+def _draw_layouts(of: LensComparison) -> Figure:
+    """The cross sections one above the other, on one scale of mm."""
+    figure = new_figure(8.0, 7.2)
+    panels = [*figure.subplots(2, 1)]
+    for panel, letter, name, drawn in zip(panels, "AB", of.names, (of.first, of.second), strict=True):
+        draw_layout(panel, drawn.lens, fields=drawn.fields)
+        panel.set_title(f"{letter}: {name}", fontsize=9)
+    on_one_scale(panels)
+    (left, right), (low, high) = panels[0].get_xlim(), panels[0].get_ylim()
+    figure.set_size_inches(8.0, min(max(2 * 7.6 * abs((high - low) / (right - left)), 3.0), 10.0) + 1.0)
+    return _finished(figure, of, coloured=False)
 
 
-def _psf(lens: Lens, model: Model, /, **options: Any) -> Psf:
-    """Kernels as `psf` gives them; on the axis and at the lens's object distance by default."""
-    return psf(lens, **{"model": model.name, "fields": lens.wavelengths.new_zeros(2, 1), **options})
+def _draw_spots(of: LensComparison) -> Figure:
+    """A row of spots for each lens, on one scale."""
+    both = [result.dots() for result in (of.first, of.second) if isinstance(result, Spots)]
+    half = max(panel_size(whole.geometric_radius.tolist(), float(airy_radius(lens))) for lens, whole, *_ in both)
+    fields, labels = of.first.fields, [field_text for field_text in _labels(of.first)]
+    count = fields.shape[1]
+    rows = -(-count // 4)
+    across = min(count, 4)
+    width = max(2.1 * across + 0.5, 5.0)
+    figure = new_figure(width, 2 * rows * (width / across + 0.45) + 1.0)
+    grid = figure.subplots(2 * rows, across, squeeze=False)
+    for panel in grid.flat:
+        panel.axis("off")
+    for f, k in ((f, k) for f in range(count) for k in (0, 1)):
+        lens, whole, dots, _ = both[k]
+        panel = grid[2 * (f // 4) + k, f % 4]
+        panel.axis("on")
+        wavelengths, airy = lens.wavelengths.tolist(), float(airy_radius(lens))
+        draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+        panel.set_title(labels[f] if k == 0 else "")
+        if f % 4 == 0:
+            panel.set_ylabel("AB"[k], rotation=0, fontsize=12, fontweight="bold", labelpad=12, va="center")
+    lens = both[0][0]
+    legend = figure.legend(
+        handles=wavelength_handles(lens.wavelengths.tolist(), float(airy_radius(lens))),
+        title=fill(f"A: {of.names[0]}\nB: {of.names[1]}", width, 8), loc="outside lower center",
+        ncols=min(6, int(width / 1.05)), handletextpad=0.3,
+    )  # fmt: skip
+    legend.get_title().set_fontsize(8)
+    figure.suptitle("spots on one scale", fontweight="bold", fontsize=10)
+    return figure
 
 
-def _relative(kernel: Tensor, other: Tensor) -> Tensor:
-    return safe_divide((kernel - other).abs().sum(), other.sum())
+def _labels(result: Any) -> Sequence[str]:
+    return field_labels(result)
 
 
-def _anisotropy(covariance: Tensor) -> float:
-    """√(larger/smaller eigenvalue) of a covariance (3,) mm²; 1 for a point."""
-    short, long = torch.linalg.eigvalsh(covariance[[0, 1, 1, 2]].reshape(2, 2)).clamp_min(0).tolist()
-    return math.sqrt(long / short) if short > 1e-18 else 1.0
+def _draw_maps(of: LensComparison) -> Figure:
+    """A row of wavefront maps at the primary wavelength for each lens, on one scale of colours."""
+    both = [result for result in (of.first, of.second) if isinstance(result, WavefrontMap)]
+    w = both[0].lens.primary_wavelength - 1
+    maps = [np.where(array(one.valid)[:, w], array(one.opd)[:, w], np.nan) for one in both]
+    colours, scale = diverging(np.stack(maps))
+    labels = field_labels(both[0])
+    across = min(len(labels), 4)
+    rows = -(-len(labels) // 4)
+    figure = new_figure(1.9 * across + 1.8, 4.9 * rows + 1.1)
+    grid = figure.subplots(2 * rows, across, squeeze=False)
+    for panel in grid.flat:
+        panel.axis("off")
+    for f, k in ((f, k) for f in range(len(labels)) for k in (0, 1)):
+        panel = grid[2 * (f // 4) + k, f % 4]
+        panel.axis("on")
+        drawn = panel.imshow(maps[k][f], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
+        panel.set(xticks=[], yticks=[])
+        panel.spines[:].set_visible(False)
+        rms, strehl = (number_text(float(v[f, w]), 3) for v in (both[k].rms, both[k].strehl))
+        panel.set_xlabel(f"RMS {rms}\nStrehl {strehl}", fontsize=7.5, color=GREY)
+        panel.set_title(labels[f] if k == 0 else "")
+        if f % 4 == 0:
+            panel.set_ylabel("AB"[k], rotation=0, fontsize=12, fontweight="bold", labelpad=12, va="center")
+    bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
+    bar.set_label("OPD (waves)")
+    bar.outline.set_visible(False)
+    wavelength = number_text(1e3 * float(primary_wavelength(both[0].lens)), 4)
+    words = f"wavefront, {wavelength} nm\nA: {of.names[0]}\nB: {of.names[1]}"
+    figure.suptitle(fill(words, figure.get_figwidth(), 9, bold=True), fontweight="bold", fontsize=9)
+    return figure
 
 
-def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid:
-    """The pixels about the centroid of the light of a field (2, 1), as the least model that traces, or not, has it."""
-    least = next(other for other in MODELS.values() if other.traces == model.traces)
-    psfs = _psf(lens, least, fields=fields, grid=pixels, **least.compared)
-    return dataclasses.replace(psfs.grid, centre=psfs.centroid[:, 0, 0].detach())
+def _draw_sums(of: LensComparison) -> Figure:
+    """Bars of the sums of the Seidel aberrations of the outermost field."""
+    sums = [flat(result.summary()) for result in (of.first, of.second)]  # type: ignore[attr-defined]
+    names = [name for name in of.first.names if len(of.first.lens.wavelengths) > 1 or name[0] != "C"]  # type: ignore[attr-defined]
+    figure = new_figure(6.0, 3.8)
+    panel: Axes = ruled(figure.add_subplot())
+    for k, (table, colour) in enumerate(zip(sums, COLOURS, strict=True)):
+        place = np.arange(len(names)) + 0.4 * k - 0.2
+        panel.bar(place, [table[name][-1] for name in names], width=0.38, color=colour)
+    panel.set_xticks(range(len(names)), names)
+    panel.axhline(0, color=GREY, linewidth=0.6)
+    panel.set_ylabel(f"sum over the surfaces ({of.first.unit})")  # type: ignore[attr-defined]
+    return _finished(figure, of)
 
 
-def _most_curved(lens: Lens) -> int:
-    """Number of the most curved refracting or reflecting surface: the image and dummy surfaces may be curved, too."""
-    indices = media(lens, lens.primary)
-    strength = {
-        k: abs(float(surface.curvature))
-        for k, surface in enumerate(lens.surfaces[:-1])
-        if k > 0 and surface.curvature is not None and (surface.is_mirror or indices[k] is not indices[k - 1])
-    }
-    if not strength:
-        raise ValueError(
-            "the comparison of PSF models changes a conic, but no refracting or reflecting surface of this lens is "
-            "curved; ask for kernels of one model by `psf`"
-        )
-    return max(strength, key=strength.__getitem__)
+def _at_fields(first: Any) -> dict[str, Any]:
+    return {"fields": first.fields}
 
 
-def _with_conic(lens: Lens) -> Lens:
-    k = _most_curved(lens)
-    conic = lens.surfaces[k].conic
-    return lens.replace(k, conic=_CONIC if conic is None else conic + _CONIC)
+_SECTIONS = {"tangential": "tangential", "sagittal": "sagittal"}
 
-
-def _dark_ring(lens: Lens, model: Model, work: Mapping[str, Any]) -> float:
-    """First minimum along x of the kernel of the slowed lens, below a twentieth of the peak; nan without one."""
-    slow = torch.clamp(first_order(lens).f_number, min=_SLOW)
-    slowed = dataclasses.replace(lens, aperture=SystemAperture("image_f_number", slow))
-    airy = 1.2197e-3 * lens.wavelengths[0] * first_order(slowed).paraxial_working_f_number
-    psfs = _psf(slowed, model, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)), **work)
-    line = psfs.kernel[0, 0, 0, 2 * _AIRY_PIXELS :].tolist()
-    for i in range(1, len(line) - 1):
-        a, b, c = line[i - 1 : i + 2]
-        # A geometric kernel falls to 0 and stays there; a ring rises again.
-        if a > b < c and b < 0.05 * line[0] and max(line[i:]) > 1e-3 * line[0]:
-            return (i + 0.5 * (a - c) / (a - 2 * b + c)) / _AIRY_PIXELS
-    return math.nan
-
-
-def _parameters(lens: Lens, model: Model, work: Mapping[str, Any]) -> int:
-    """Number of variables of the lens that change the kernel on a sensor 8 λN² behind its own: in no model a point."""
-    surfaces, numbers = list(lens.surfaces), list[Tensor]()
-    for k, surface in enumerate(surfaces[:-1]):
-        changes: dict[str, Any] = {"thickness": surface.thickness}
-        if surface.curvature is not None and float(surface.curvature) != 0:
-            conic = torch.zeros_like(surface.thickness) if surface.conic is None else surface.conic
-            changes |= {"curvature": surface.curvature, "conic": conic}
-        changes = {key: number.detach().clone().requires_grad_() for key, number in changes.items()}
-        numbers += changes.values()
-        surfaces[k] = dataclasses.replace(surface, **changes)
-    lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
-    number = first_order(lens).paraxial_working_f_number.detach()
-    blur = 1e-3 * lens.wavelengths[0] * number
-    lens = with_sensor_distance(lens, surfaces[-2].thickness + 8 * blur * number)
-    work = {**work, "tol": 0.05} if "tol" in work else work
-    psfs = _psf(lens, model, grid=grid(2 * blur, 5), **work)
-    gradients = torch.autograd.grad(psfs.kernel.square().sum(), numbers, allow_unused=True)
-    slopes = [float(gradient) for gradient in gradients if gradient is not None]
-    return sum(math.isfinite(slope) and slope != 0 for slope in slopes)
+#: Analyses that are compared, by the name of their function.
+COMPARED: dict[str, Compared] = {
+    "layout": Compared(layout, _at_fields, _draw_layouts, at_fields=True),
+    "spot": Compared(spot, _at_fields, _draw_spots, at_fields=True),
+    "ray_fan": Compared(ray_fan, _at_fields, Curves(
+        "pupil", "pupil coordinate", "transverse aberration (µm)", _SECTIONS, ("field", "curve"), factor=1e3),
+        at_fields=True),
+    "opd_fan": Compared(opd_fan, _at_fields, Curves(
+        "pupil", "pupil coordinate", "OPD (waves)", _SECTIONS, ("field", "curve")), at_fields=True),
+    "wavefront": Compared(wavefront, _at_fields, _draw_maps, summary=True, at_fields=True),
+    "mtf": Compared(mtf, lambda first: {"fields": first.fields, "frequencies": first.frequencies}, Curves(
+        "frequency", "spatial frequency (cycles/mm)", "modulation", _SECTIONS, ("field",), limits=(0, 1)),
+        at_fields=True),
+    "encircled_energy": Compared(encircled_energy, lambda first: {"fields": first.fields, "radii": first.radii}, Curves(
+        "radius", "radius from the centroid (µm)", "encircled energy", {"share": "encircled energy"}, ("field",),
+        x_factor=1e3, limits=(0, 1.02)), at_fields=True),
+    "distortion": Compared(distortion, _at_fields, Curves(
+        "field", "", "distortion (%)", {
+        "f_tan_percent": "F-tan θ distortion (%)", "f_theta_percent": "F-θ distortion (%)"},
+        ("curve",), upright=True, is_shared=False),
+        at_fields=True),
+    "field_curvature": Compared(field_curvature, _at_fields, Curves(
+        "field", "", "focus from the sensor (mm)", _SECTIONS, ("wavelength",), upright=True), at_fields=True),
+    "lateral_colour": Compared(lateral_colour, _at_fields, Curves(
+        "field", "", "lateral colour (µm)", {"shift": "lateral colour"}, factor=1e3, upright=True), at_fields=True),
+    "relative_illumination": Compared(relative_illumination, _at_fields, Curves(
+        "field", "", "relative illumination", {"illumination": "relative illumination"}, limits=(0, None)),
+        at_fields=True),
+    "rms_over_field": Compared(rms_over_field, _at_fields, Curves(
+        "field", "", "RMS wavefront error (waves)", {"rms": "RMS wavefront error"}, ("wavelength",), limits=(0, None)),
+        at_fields=True),
+    "longitudinal_aberration": Compared(longitudinal_aberration, lambda first: {}, Curves(
+        "pupil", "height in the pupil", "crossing with the axis, from the sensor (mm)", {"crossing": "crossing"},
+        upright=True)),
+    "chromatic_focal_shift": Compared(chromatic_focal_shift, lambda first: {}, Curves(
+        "wavelength", "wavelength (µm)", "paraxial focus, from that of the primary wavelength (mm)", {"shift": "focus"},
+        upright=True)),
+    "seidel": Compared(seidel, _at_fields, _draw_sums, summary=True, at_fields=True),
+    "thermal": Compared(thermal, lambda first: {"fields": first.fields, "modulation_frequency": float(first.frequency)},
+        Curves("temperature", "temperature (°C)", "", {
+            "focus_shift_um": "focus shift (µm)", "rms_fixed_um": "RMS spot radius, fixed (µm)",
+            "modulation_fixed": "lowest modulation, fixed"}, ("curve",), is_shared=False), at_fields=True),
+}  # fmt: skip

@@ -47,6 +47,7 @@ class LongitudinalAberration(Analysis):
         by_wavelength(panel, self, seen(self.crossing, self.valid).T, array(self.pupil), linewidth=1.4)
         panel.axvline(0, color=GREY, linewidth=0.6)
         panel.set_ylim(0, 1)
+        panel.locator_params(axis="x", nbins=6)
         drawn_at_least([panel], 1e-6, "x")
         return finished(panel, self, "longitudinal aberration", 3)
 

@@ -155,15 +155,8 @@ class Spots(Result):
         the primary one (`reference`), and print the RMS and the geometric radius about it. Raises ValueError for a
         batch of lenses.
         """
-        if self.lens.count is not None:
-            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
-        lens, points, rays = detached(self.lens), self.fields.detach(), self._kept(option("plot"))
-        about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
-        whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
-        radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
-        centre = self.whole.centroid.detach() if about is None else about  # of the panels
-        whole = dataclasses.replace(whole, centroid=centre, **radii)
-        fields, wavelengths = style.array(points), lens.wavelengths.tolist()
+        lens, whole, dots, about = self.dots()
+        fields, wavelengths = style.array(self.fields), lens.wavelengths.tolist()
         airy = float(airy_radius(lens))
         half = panel_size(whole.geometric_radius.tolist(), airy)
         columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
@@ -189,6 +182,18 @@ class Spots(Result):
         )  # fmt: skip
         legend.get_title().set(color=style.GREY, multialignment="center")
         return figure
+
+    def dots(self) -> tuple[Lens, Spot, Spot, Tensor | None]:
+        """For drawing: the lens, the spots (F,) of all wavelengths, the spots (F, W) of the rays that are dots, and the
+        chief points (2, F) that the panels are centred on, None for centroids."""
+        if self.lens.count is not None:
+            raise ValueError("a spot diagram shows one lens, not a batch: choose one, as lens[0]")
+        lens, points, rays = detached(self.lens), self.fields.detach(), self._kept(option("plot"))
+        about = chief_reference(lens, points)[..., 0] if self.reference == "chief" else None
+        whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
+        radii = {name: getattr(self.whole, name).detach() for name in ("rms_radius", "geometric_radius")}
+        centre = self.whole.centroid.detach() if about is None else about  # of the panels
+        return lens, dataclasses.replace(whole, centroid=centre, **radii), dots, about
 
     def save(self, path: str | PathLike) -> None:
         """Write the rays as .csv: field, wavelength, pupil point, x, y, weight, status."""

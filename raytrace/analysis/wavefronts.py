@@ -107,7 +107,7 @@ class WavefrontMap(Analysis):
         grid = figure.subplots(*shape, squeeze=False)
         axes = grid.reshape(-1, 1) if flows else grid
         opd = seen(self.opd, self.valid)
-        colours, scale = _diverging(opd)
+        colours, scale = diverging(opd)
         for row, w in itertools.product(range(len(labels)), range(count)):
             panel = axes[row, w]
             drawn = panel.imshow(opd[row, w], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
@@ -222,7 +222,7 @@ def _strehl(view: Scene) -> Tensor:
     return torch.cat(ratios, 1)
 
 
-def _diverging(values: np.ndarray) -> tuple["ListedColormap", "Normalize"]:
+def diverging(values: np.ndarray) -> tuple["ListedColormap", "Normalize"]:
     """Blue below 0, white at 0, red above, equally deep on either side; from the least to the largest of the values."""
     import matplotlib
     from matplotlib.colors import ListedColormap, Normalize

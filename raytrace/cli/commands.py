@@ -54,8 +54,10 @@ from raytrace.cli.types import (
     picture_or_folder,
     positive,
     positive_finite,
+    report_file,
 )
 from raytrace.cli.wave_options import ENGINE, camera, element, light, pixels
+from raytrace.settings import COMPARED, ON_REQUEST, SECTIONS
 
 
 @dataclass(frozen=True)
@@ -328,6 +330,47 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
             Option("substrate", positive_finite, "MM", "thickness of mirrors (default: a sixth of their diameter)"),
         ),
         Option("date", None, "TEXT", "of the title block; of STEP files as 2026-11-29", default=""),
+    ),
+    _command(
+        "report",
+        "one document of a lens: figures, tables, conditions, tolerances",
+        f"""\
+Write a report of a lens as .pdf, or as one .html file without references to others. Its numbers and figures are those
+of the commands of its sections; a section that does not apply to the lens gives the reason in a line. Zoom lenses are
+shown in all configurations. .json has the results of all sections.
+
+Sections: {", ".join(name for name in SECTIONS if name not in ON_REQUEST)}
+on request: {", ".join(ON_REQUEST)}""",
+        """
+        double_gauss -o report.pdf
+        cooke_triplet --grade precision --tolerance --trials 500 -o report.html
+        tessar --only layout spots mtf -o figures.pdf
+        lens.zmx --without fans conditions --also seidel drawings -o report.pdf
+        zoom.zmx --configuration 2 --field 0 5 10 -o tele.pdf
+        double_gauss --range -20 60 --mount aluminium -o report.pdf""",
+        "lens", row("configuration", "which one of a multi-configuration file, from 1 (default: all)"), *LENS[2:],
+        CONDITIONS, Option("output", report_file, "OUT", "report to write: .pdf, .html, .json", "-o --output",
+                                  required=True),
+        "fields",
+        group(
+            "sections",
+            Option("only", None, "SECTION", "these sections alone", nargs="+", choices=SECTIONS, default=()),
+            Option("without", None, "SECTION", "sections to leave out", nargs="+", choices=SECTIONS, default=()),
+            Option("also", None, "SECTION", "sections in addition", nargs="+", choices=SECTIONS, default=()),
+            Option("date", None, "TEXT", "of the title (default: today)"),
+        ),
+        group(
+            "tolerances",
+            row("grade", "tolerances of a published grade instead of the file's"),
+            row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            switch("tolerance", "with the section as-built: sensitivities, expectation and Monte Carlo, as of "
+                "`tolerance`"),
+            Option("criterion", help="of the lens as built, as of `tolerance`", default="rms"),
+            Option("trials", count_or_none, "N", "perturbed lenses", default=1000),
+            row("seed", "seed of random numbers"),
+        ),
+        Option("temperatures", finite, ("LOW", "HIGH"), "with the section temperature, from the lowest to the highest, "
+            "°C (default: -20 60, if the file has temperatures or expansions)", flag="--range", nargs=2),
     ),
     _command(
         "spot",
@@ -626,6 +669,27 @@ interpolated. -o names a file, or a folder for several pictures, which share the
     ),
     _command(
         "compare",
+        "compare two lenses by any analysis, in one table and one figure",
+        f"""\
+Compare two lenses, such as one before (LENS) and after (OTHER) an optimisation: a table of both and of their
+differences, and with --plot one figure of one scale. Fields and wavelengths of both are those of LENS. (PSF models of
+one lens: compare-models.)
+
+Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
+        """
+        before.zmx after.zmx
+        before.zmx after.zmx --analysis mtf --plot mtf.png
+        cooke_triplet tessar --analysis spot --field 0 10 --plot spots.pdf
+        before.zmx after.zmx --analysis ray-fan --wavelength 0.55 -o fans.csv""",
+        "lens", Option("other", file_name, "OTHER", "the second lens, a file or the name of a shipped lens",
+                       flag="other"), *LENS[1:], CONDITIONS, plot("both lenses in one figure"), TABLE,
+        Option("analysis", None, None, "what is compared", choices=COMPARED, default="layout"), "fields",
+        Option("frequencies", positive_finite, "F", "of mtf, cycles/mm (default: to the higher resolution of both)",
+               flag="--frequency", nargs="+"),
+        run="cli.runs:compare",
+    ),
+    _command(
+        "compare-models",
         "compare the PSF models",
         "Compare DRT (256 rays), Gaussian DRT, paraxial, Fourier and wave PSFs on the axis over object distance, with "
         "one sensor, in windows of 21 pixels of 5 µm, by default at 0.53 µm. The table lists for each model: change of "

@@ -83,6 +83,17 @@ def spot(arguments: argparse.Namespace) -> Result:
     return result_of_lens(arguments, raytrace.spot)
 
 
+def compare(arguments: argparse.Namespace) -> Result:
+    """An analysis of two lenses, named by their files."""
+    names = (arguments.lens, arguments.other)
+    first, second = (open_lens(argparse.Namespace(**{**vars(arguments), "lens": name})) for name in names)
+    options = options_of(arguments) | {"other": second, "names": names}
+    try:
+        return raytrace.compare(first, **options)
+    except ValueError as error:
+        raise CommandError(f"{names[0]}, {names[1]}: {error}") from error
+
+
 def focus(arguments: argparse.Namespace) -> Result:
     """The focus; -o writes the lens of the file with the new sensor distance, without the conditions of the options."""
     result = result_of_lens(arguments, raytrace.focus)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import TypeAlias
 
-from raytrace.settings import DRAWINGS
+from raytrace.settings import DRAWINGS, REPORTS
 
 Reader: TypeAlias = Callable[[str], object]
 
@@ -70,6 +70,17 @@ def drawing_file(text: str) -> OutputFile:
     if PurePath(text).suffix.lower() not in file.suffixes:
         raise argparse.ArgumentTypeError(
             f"{text!r} is no drawing: expected a name that ends in {', '.join(file.suffixes)}"
+        )
+    return file
+
+
+def report_file(text: str) -> OutputFile:
+    """A report to write."""
+    file = output_file(text)
+    file.suffixes = REPORTS
+    if PurePath(text).suffix.lower() not in file.suffixes:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no report: expected a name that ends in {', '.join(file.suffixes)}"
         )
     return file
 

@@ -165,13 +165,13 @@ class Result:
             tables = self.tables()
         except TypeError:
             return _block(str(self).splitlines())
-        parts = ((_block(t.title), html_table(self._printed(t.columns)), _block(t.notes)) for t in tables)
+        parts = ((_block(t.title), html_table(self.printed(t.columns)), _block(t.notes)) for t in tables)
         return "\n".join(part for table in parts for part in table if part)
 
     def _lines(self, columns: Columns) -> list[str]:
-        return text_table(self._printed(columns))
+        return text_table(self.printed(columns))
 
-    def _printed(self, columns: Columns) -> dict[Column, Sequence]:
+    def printed(self, columns: Columns) -> dict[Column, Sequence]:
         """Columns as they are printed, without field_x where it is 0."""
         listed: dict[Any, Any] = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}
         words, printed = self.words(), {}
@@ -241,7 +241,7 @@ def cell(value: float, form: str) -> str:
     return shown if float(shown) else f"{0.0:{form.removeprefix('<')}}"  # a number that rounds to 0 has no sign
 
 
-def _cells(column: Column, values: Sequence) -> list[str]:
+def cells(column: Column, values: Sequence) -> list[str]:
     """The texts of a column: two lines of its heading with its unit, and its numbers or texts."""
     first, _, second = (column.heading or column.name).partition("\n")
     shown = [value if isinstance(value, str) else cell(value, column.form) for value in values]
@@ -252,9 +252,9 @@ def text_table(columns: Mapping[Column, Sequence]) -> list[str]:
     """Lines of columns of numbers, or of texts, under their headings and units."""
     texts = []
     for column, values in columns.items():
-        cells = _cells(column, values)
-        width = max(map(len, cells))
-        texts.append([text.ljust(width) if column.form.startswith("<") else text.rjust(width) for text in cells])
+        shown = cells(column, values)
+        width = max(map(len, shown))
+        texts.append([text.ljust(width) if column.form.startswith("<") else text.rjust(width) for text in shown])
     lines = ["  ".join(row).rstrip() for row in zip(*texts, strict=True)]
     return [line for k, line in enumerate(lines) if k > 1 or line]
 
@@ -264,7 +264,7 @@ def html_table(columns: Mapping[Column, Sequence]) -> str:
     if not columns:
         return ""
     sides = ["left" if column.form.startswith("<") else "right" for column in columns]
-    first, second, *body = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
+    first, second, *body = zip(*(cells(column, values) for column, values in columns.items()), strict=True)
     heads = ["<br>".join(filter(None, map(html.escape, pair))) for pair in zip(first, second, strict=True)]
     lines = [("th", heads), *(("td", map(html.escape, row)) for row in body[:MOST_ROWS])]
     table = "\n".join(

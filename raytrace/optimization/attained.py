@@ -107,17 +107,21 @@ def table_of(results: Sequence[Attained]) -> list[str]:
     """The lines of a table of the conditions and boundaries that are `shown`; none without any."""
     if not results:
         return []
-    rows, more = shown(results), len(results) - len(shown(results))
-    remarks = [", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in rows]
-    lines = text_table(
-        {
-            Column("condition", form="<"): [row.name for row in rows],
-            Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in rows],
-            Column("reached"): [row.reached for row in rows],
-            Column("remark", form="<", heading=" "): remarks,
-        }
-    )
+    lines, more = text_table(columns_of(results)), len(results) - len(shown(results))
     return [*lines, f"and {more} more boundaries, met"] if more else lines
+
+
+def columns_of(results: Sequence[Attained]) -> dict[Column, list]:
+    """The columns of a table of the conditions and boundaries that are `shown`."""
+    rows = shown(results)
+    return {
+        Column("condition", form="<"): [row.name for row in rows],
+        Column("asked"): [f"{row.relation} {row.asked:.6g}" for row in rows],
+        Column("reached"): [row.reached for row in rows],
+        Column("remark", form="<", heading=" "): [
+            ", ".join(filter(None, ["" if row.met else "not met", row.place])) for row in rows
+        ],
+    }
 
 
 def attained(problem: Specification, evaluated: Evaluated) -> tuple[Attained, ...]:

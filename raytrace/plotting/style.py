@@ -286,14 +286,16 @@ def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
     return "\n".join(lines)
 
 
-@functools.lru_cache(maxsize=1024)
+@functools.lru_cache(maxsize=8192)
 def _width(word: str, size: float, bold: bool) -> float:
     """Points that a word of a size in points takes, from where it begins to where the next letter would."""
     from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
+    from matplotlib.textpath import text_to_path
 
     font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
-    between, none = (TextPath((0, 0), letters, prop=font).get_extents().width for letters in (f"n{word}n", "nn"))
+    between, none = (
+        text_to_path.get_text_width_height_descent(letters, font, ismath=False)[0] for letters in (f"n{word}n", "nn")
+    )
     return between - none
 
 

@@ -17,7 +17,7 @@
 | figures         | figures of PSFs, the finely sampled light in them                                            |
 
 To add a model: a module with `kernels(scene, grid, *, order) -> Kernels`, a class of its numbers and a row of `_ROWS`
-in `models`; `psf`, the command and `rt.compare` read the row.
+in `models`; `psf`, the command and `rt.compare_models` read the row.
 
 Tests: tests/test_psf_MODULE.py; test_psf (the call), test_psf_laws (all models), test_psf_estimates (tolerances),
 test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_shards (processes), test_plot_psf.

@@ -192,32 +192,59 @@ class Info(Result):
             **({"conditions": conditions} if (conditions := self._conditions_in_words()) else {}),
         }
 
-    def tables(self) -> list[Table]:
+    def quantities(self) -> list[tuple[str, str, str]]:
+        """First-order data: quantity, value, and unit or definition."""
+        figures = zip(FIRST_ORDER_LINES, _figures(detached(self.lens)), strict=True)
+        return [(words, _quantity(figure), unit) for (words, _, unit), figure in figures]
+
+    def base_ray_quantities(self) -> list[tuple[str, str, str, str]]:
+        """Data about the axial chief ray of a lens whose axis bends or whose sections differ: quantity, tangential,
+        sagittal, unit; none of other lenses."""
         lens = detached(self.lens)
-        lines = [lens.name or "Lens", ""]
-        for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
-            lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
-        lines += _base_ray_lines(lens)
+        if is_round_about_axis(lens) or not bool((base := base_ray(lens)).valid):  # the sections agree in the former
+            return []
+        pairs = [(words, map(_quantity, getattr(base, name).tolist()), unit) for words, name, unit in BASE_RAY_LINES]
+        return [(words, tangential, sagittal, unit) for words, (tangential, sagittal), unit in pairs]
+
+    def scene(self) -> list[tuple[str, str]]:
+        """Wavelengths, fields, ray aiming, configuration and environment: quantity and text."""
+        lens = detached(self.lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several, which = len(lens.wavelengths) > 1, _configuration(lens)
         aiming = lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
-        shown = [
+        shown = ", ".join(
             f"{w:g}" + ("*" if i == lens.primary_wavelength - 1 and several else "")
             for i, w in enumerate(lens.wavelengths.tolist())
+        )
+        primary = f"  (* primary: number {lens.primary_wavelength})" if several else ""
+        return [
+            ("wavelengths", f"{shown} µm{primary}"),
+            *([("telecentric", f"in {' and '.join(spaces)} space")] if (spaces := _telecentric(lens)) else []),
+            ("ray aiming", aiming),
+            *([("configuration", " of ".join(map(str, which.values())))] if which else []),
+            ("fields", f"{points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}"),
+            *([("environment", environment_in_words(lens.environment))] if lens.environment else []),
         ]
-        lines += [
-            f"  {'wavelengths':<24} {', '.join(shown)} µm"
-            + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
-            *([f"  {'telecentric':<24} in {' and '.join(spaces)} space"] if (spaces := _telecentric(lens)) else []),
-            f"  {'ray aiming':<24} {aiming}",
-            *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
-            f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
-            *([f"  {'environment':<24} {environment_in_words(lens.environment)}"] if lens.environment else []),
-            "",
-        ]
+
+    def tables(self) -> list[Table]:
+        lens = detached(self.lens)
+        lines = [lens.name or "Lens", ""]
+        lines += [f"  {words:<24} {figure:>16}  {unit}".rstrip() for words, figure, unit in self.quantities()]
+        lines += self._base_ray_lines()
+        lines += [*(f"  {words:<24} {text}" for words, text in self.scene()), ""]
         radius = ["-" if s.is_break else _radius(s) for s in lens.surfaces]
         conditions = self._conditions_in_words()
         return [Table({**self.columns(), "radius": radius}, lines, ["", *conditions] if conditions else [])]
+
+    def _base_ray_lines(self) -> list[str]:
+        if is_round_about_axis(self.lens):
+            return []
+        rows = self.base_ray_quantities()
+        if not rows:
+            return ["", "  the axial chief ray does not reach the image"]
+        lines = ["", f"  {'about the axial chief ray':<24} {'tangential':>16} {'sagittal':>16}"]
+        lines += [f"  {words:<24} {one:>16} {other:>16}  {unit}".rstrip() for words, one, other, unit in rows]
+        return [*lines, ""]
 
     def _conditions_in_words(self) -> list[str]:
         """The conditions and boundaries of the lens, with the values that it has."""
@@ -292,19 +319,6 @@ def _base_ray_document(lens: Lens) -> dict:
     figures = {name: numbers(getattr(base, name)) for _, name, _ in BASE_RAY_LINES}
     place = {"position": numbers(base.position), "direction": numbers(base.direction)}
     return {"base_ray": {"valid": bool(base.valid), **place, **figures}}
-
-
-def _base_ray_lines(lens: Lens) -> list[str]:
-    if is_round_about_axis(lens):  # the sections agree with the straightened lens
-        return []
-    base = base_ray(lens)
-    if not bool(base.valid):
-        return ["", "  the axial chief ray does not reach the image"]
-    lines = ["", f"  {'about the axial chief ray':<24} {'tangential':>16} {'sagittal':>16}"]
-    for words, name, unit in BASE_RAY_LINES:
-        figures = " ".join(f"{_quantity(figure):>16}" for figure in getattr(base, name).tolist())
-        lines.append(f"  {words:<24} {figures}  {unit}".rstrip())
-    return [*lines, ""]
 
 
 def _remarks(lens: Lens, k: int) -> str:

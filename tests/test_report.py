@@ -1,0 +1,305 @@
+"""Reports: numbers are those of the functions, pages and HTML hold them, and every kind of lens has one."""
+
+import html.parser
+import json
+import re
+import zlib
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+import raytrace as rt
+from raytrace.plotting.style import text_width
+from raytrace.settings import ON_REQUEST, SECTIONS
+from raytrace.workshop.document import Document, Heading, Picture, Section, rows_grid
+from raytrace.workshop.pages import _FOOT, ROOM, TALL, _paginated, pdf
+from raytrace.workshop.report import KINDS_OF_SECTIONS, BadReport
+from raytrace.workshop.web import page
+
+DATE = "2026-11-29"
+QUICK = ("first-order", "prescription", "layout", "spots", "field-curves", "distortion")
+
+
+@pytest.fixture(scope="module")
+def report():
+    return rt.report("cooke_triplet", only=[*QUICK, "fans", "tolerances"], grade="precision", date=DATE)
+
+
+def text_of(content: bytes) -> list[str]:
+    """The texts of the pages of a PDF file, in the order of its streams."""
+    pages = []
+    for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", content, flags=re.DOTALL):
+        try:
+            body = zlib.decompress(stream)
+        except zlib.error:
+            body = stream
+        if b" Tf" not in body:
+            continue
+        shown = re.findall(rb"\[((?:[^\]\\]|\\.)*)\] TJ|\(((?:[^)\\]|\\.)*)\) Tj", body)
+        lines = (b"".join(re.findall(rb"\(((?:[^)\\]|\\.)*)\)", kerned)) or plain for kerned, plain in shown)
+        pages.append("\n".join(re.sub(rb"\\([()\\])", rb"\1", line).decode("latin-1") for line in lines))
+    return pages
+
+
+def results(report, name: str) -> list[dict]:
+    return next(s for s in report.document()["sections"] if s["name"] == name)["results"]
+
+
+def test_every_number_is_that_of_the_function(report):
+    lens = rt.read_lens("cooke_triplet")
+    expected = {
+        "first-order": [rt.info(lens)],
+        "spots": [rt.spot(lens)],
+        "fans": [rt.ray_fan(lens), rt.opd_fan(lens)],
+        "distortion": [rt.distortion(lens, samples=6)],
+        "tolerances": [rt.tolerances(lens, grade="precision")],
+        "field-curves": [
+            rt.field_curvature(lens, samples=6), rt.longitudinal_aberration(lens), rt.lateral_colour(lens, samples=6),
+            rt.chromatic_focal_shift(lens),
+        ],
+    }  # fmt: skip
+    for name, functions in expected.items():
+        assert results(report, name) == json.loads(json.dumps([one.document() for one in functions])), name
+
+
+def test_the_pages_hold_the_numbers_and_are_counted(report):
+    content = pdf(report.content)
+    pages = text_of(content)
+    count = len(re.findall(rb"/Type /Page\b", content))
+    assert count == len(pages) > 4
+    for number, text in enumerate(pages, 1):
+        assert f"page {number} of {count}" in text
+        assert DATE in text
+    whole = "\n".join(pages)
+    for _, figure, _ in rt.info("cooke_triplet").quantities():
+        assert figure.lstrip("-") in whole
+    for surface in rt.read_lens("cooke_triplet").surfaces[1:-1]:
+        curvature = float(surface.curvature or 0)
+        assert not curvature or f"{abs(1 / curvature):.6g}" in whole
+    rms = rt.spot("cooke_triplet").rms_radius[-1, -1]
+    assert f"{1e3 * float(rms):.4f}" in whole
+
+
+def test_the_contents_name_the_page_of_every_section(report):
+    pages = text_of(pdf(report.content))
+    lines = pages[0].partition("Contents\n")[2].splitlines()
+    count = len(report.content.sections)
+    for number, section in enumerate(report.content.sections, 1):
+        entry = re.compile(rf"{number}\s+{re.escape(section.title)}")
+        assert entry.fullmatch(lines[number - 1])
+        named = int(lines[count + number - 1])
+        places = [k for k, text in enumerate(pages, 1) for line in text.splitlines() if entry.fullmatch(line)]
+        assert places == sorted([1, named])
+
+
+def test_no_text_leaves_the_page_and_no_figure_overlaps_one(report):
+    for placed in _paginated(report.content)[0]:
+        bottom = 0.0
+        for top, piece in placed:
+            assert top >= bottom - 1e-6
+            bottom = top + piece.height
+            for x, _, text, look in piece.texts:
+                width = text_width(text, look["fontsize"]) * (1.15 if look.get("weight") == "bold" else 1)
+                left = x - width if look.get("ha") == "right" else x
+                assert left >= -2, text
+                assert left + width <= ROOM + 2, text
+            for figure, x, y, scale in piece.pictures:
+                wide, tall = 72 * scale * figure.get_size_inches()
+                assert x >= -1e-6
+                assert x + wide <= ROOM + 1e-6
+                assert y + tall <= piece.height
+        assert bottom <= TALL + 2 * _FOOT
+
+
+def test_a_report_is_the_same_twice(report):
+    assert pdf(report.content) == pdf(report.content)
+    assert page(report.content) == page(report.content)
+
+
+class Reader(html.parser.HTMLParser):
+    """Checks the nesting of tags, and collects what a report has."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.cells, self.links, self.ids, self.sources = [], [], [], set(), []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        self.links += [values["href"]] if tag == "a" else []
+        self.ids |= {values["id"]} if "id" in values else set()
+        self.sources += [values["src"]] if "src" in values else []
+        assert tag not in ("script", "link", "iframe")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["td"]:
+            self.cells.append(data)
+
+
+def test_the_html_file_is_whole_and_refers_to_no_other(report, tmp_path):
+    report.save(tmp_path / "report.html")
+    content = (tmp_path / "report.html").read_text("utf-8")
+    reader = Reader()
+    reader.feed(content)
+    assert reader.open == []
+    assert reader.links == [f"#{section.name}" for section in report.content.sections]
+    assert {link[1:] for link in reader.links} <= reader.ids
+    figures = [block for s in report.content.sections for block in s.blocks if isinstance(block, Picture)]
+    assert len(reader.sources) == len(figures) > 6
+    assert all(source.startswith(("data:image/svg+xml;base64,", "data:image/png;base64,")) for source in reader.sources)
+    assert not re.search(r"https?://", content)
+    assert 'name="viewport"' in content
+    rms = rt.spot("cooke_triplet").rms_radius
+    assert {f"{1e3 * number:.4f}" for number in rms.flatten().tolist()} <= set(reader.cells)
+
+
+def test_words_of_a_lens_do_not_become_tags_or_mathematics(tmp_path):
+    lens = rt.edit.rename("singlet", "A <b>lens</b> & $x_1$")
+    report = rt.report(lens, only=["first-order"], date="")
+    assert "<b>" not in page(report.content)
+    assert any("A <b>lens</b> & $x_1$" in text for text in text_of(pdf(report.content)))
+
+
+def zoom():
+    rows = [
+        {"radius": 60, "thickness": 5, "glass": "N-BK7"}, {"radius": -80, "thickness": 20},
+        {"radius": -50, "thickness": 3, "glass": "N-SF5"}, {"radius": 70, "thickness": 60},
+    ]  # fmt: skip
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=8, fields=[0, 3], wavelengths=[0.55])
+    return lens.with_configurations(thickness={2: [20.0, 15.0], 4: [60.0, 90.0]})
+
+
+def test_a_zoom_is_shown_in_all_configurations_or_in_one():
+    report = rt.report(zoom(), only=["first-order", "prescription", "layout", "spots"], date=DATE)
+    lenses = zoom().configurations
+    assert results(report, "first-order") == [rt.info(lens).document() for lens in lenses]
+    assert results(report, "spots") == [rt.spot(lens).document() for lens in lenses]
+    assert len(results(report, "layout")) == 3  # all superimposed, and each
+    spots = next(section for section in report.content.sections if section.name == "spots")
+    headings = [block.text for block in spots.blocks if isinstance(block, Heading)]
+    assert headings == ["Configuration 1", "Configuration 2"]
+    one = rt.report(zoom(), only=["spots"], configuration=2, date=DATE)
+    assert results(one, "spots") == [rt.spot(lenses[1]).document()]
+
+
+@pytest.mark.parametrize(
+    ("name", "gaps"),
+    [
+        ("hubble", {}),
+        ("folded_relay", {}),
+        ("spectrometer", {"distortion": "all fields are on the axis"}),
+    ],
+)
+def test_mirrors_breaks_and_lenses_without_fields_have_a_report(name, gaps):
+    report = rt.report(name, only=QUICK, date=DATE)
+    for section in report.content.sections:
+        assert gaps.get(section.name, "") in section.gap
+        assert "\n" not in section.gap
+        assert bool(section.gap) == (section.name in gaps), section
+    assert len(text_of(pdf(report.content))) > 1
+
+
+def test_an_afocal_lens_has_a_report():
+    rows = [
+        {"radius": 100, "thickness": 6, "glass": "N-BK7"}, {"radius": float("inf"), "thickness": 290},
+        {"radius": float("inf"), "thickness": 4, "glass": "N-BK7"}, {"radius": -50, "thickness": 30},
+    ]  # fmt: skip
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10, fields=[0, 1], wavelengths=[0.5876])
+    report = rt.report(lens, only=[*QUICK, "mtf"], date=DATE)
+    assert len(report.content.sections) == len(QUICK) + 1
+    assert pdf(report.content)
+
+
+def test_conditions_and_the_lens_as_built_are_listed():
+    lens = rt.read_lens("cooke_triplet").with_conditions("efl=100 total_track<=90")
+    report = rt.report(
+        lens, only=["conditions"], tolerance=True, grade="precision", trials=8, date=DATE, temperatures=None
+    )
+    names = [section.name for section in report.content.sections]
+    assert names == ["conditions", "as-built"]
+    (conditions,) = results(report, "conditions")
+    by_name = {row["name"]: row for row in conditions["conditions"]}
+    assert by_name["efl"]["reached"] == pytest.approx(float(rt.first_order(lens).effective_focal_length), rel=1e-12)
+    assert not by_name["efl"]["met"]
+    (built,) = results(report, "as-built")
+    expected = rt.tolerance(lens, grade="precision", trials=8).document()
+    assert built["nominal"] == expected["nominal"]
+    assert built["mean"] == expected["mean"]
+
+
+def test_sections_are_chosen_and_counted():
+    assert set(KINDS_OF_SECTIONS) == set(SECTIONS)
+    assert set(ON_REQUEST) < set(SECTIONS)
+    counted = []
+
+    def progress(work, unit):
+        counted.append((list(work), unit))
+        return work
+
+    report = rt.report(
+        "singlet", only=["layout", "first-order", "mtf"], without=["mtf"], also=["seidel"], progress=progress, date=DATE
+    )
+    names = ["first-order", "layout", "seidel"]
+    assert [section.name for section in report.content.sections] == names
+    assert counted == [(names, "section")]
+
+
+def test_warnings_are_notes_once():
+    lens = rt.read_lens("double_gauss").at(entrance_pupil_diameter=60.0)
+    report = rt.report(lens, only=["first-order", "spots"], date=DATE)
+    notes = [b for s in report.content.sections for b in s.blocks if isinstance(b, str) and b.startswith("Note: ")]
+    assert notes
+    assert len(notes) == len(set(notes))
+
+
+def test_long_tables_have_their_head_on_every_page():
+    rows = [(str(k), "word " * 30, f"{k / 7:.6f}") for k in range(200)]
+    grid = rows_grid(("number", "text", "value"), rows, "rlr")
+    pages = text_of(pdf(Document("Title", (), (Section("a", "A", (grid,)),))))
+    assert len(pages) > 5
+    for text in pages:
+        assert "number" in text
+    numbers = [line for text in pages for line in text.splitlines() if re.fullmatch(r"0\.\d{6}|\d+\.\d{6}", line)]
+    assert numbers == [row[2] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": "report.docx"}, r"report\.docx: expected a name that ends in \.pdf, \.html"),
+        ({"only": ["spot"]}, "`only=spot`: no such section; did you mean spots?"),
+        ({"only": ["spots"], "without": ["spots"]}, "leaves no section"),
+        ({"configuration": 3}, "configuration 3: this lens has one configuration"),
+    ],
+)
+def test_wrong_options_are_refused_before_the_work(options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        rt.report("singlet", **options)
+    assert not [*tmp_path.iterdir()]
+    assert issubclass(BadReport, rt.RaytraceError)
+
+
+def test_the_command_writes_a_report_or_one_line(command):
+    code, out, err = command(
+        "report", "singlet", "--only", "first-order", "layout", "--date", DATE, "-o", "report.html"
+    )
+    assert code == 0, err
+    assert "written: report.html" in err
+    assert "Layout" in out
+    assert 'src="data:image' in Path("report.html").read_text("utf-8")
+    code, out, err = command("report", "singlet", "-o", "report.txt")
+    assert code == 2
+    assert "is no report: expected a name that ends in .pdf, .html" in err
+    assert not Path("report.txt").exists()
+
+
+def test_the_style_of_the_user_does_not_change(report):
+    before = dict(matplotlib.rcParams)
+    pdf(report.content)
+    assert dict(matplotlib.rcParams) == before
