@@ -1,4 +1,4 @@
-"""Two lenses compared: numbers are those of the functions in one scene, the figure has one scale, errors are one line."""
+"""Two lenses compared: numbers are those of the functions in one scene, figures have one scale, errors are one line."""
 
 import json
 from pathlib import Path

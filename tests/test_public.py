@@ -361,7 +361,10 @@ NEEDED = {
 
 @pytest.mark.parametrize(
     "command",
-    [pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in ("compare-models", "psf") else ()) for c in OF_A_LENS],
+    [
+        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in ("compare-models", "psf") else ())
+        for c in OF_A_LENS
+    ],
 )
 def test_a_command_prints_the_result_of_its_function(command, capsys, monkeypatch):
     """As JSON by the function itself; as text the result already computed."""

@@ -27,18 +27,38 @@ def report():
 
 
 def text_of(content: bytes) -> list[str]:
-    """The texts of the pages of a PDF file, in the order of its streams."""
+    """The texts of the pages of a PDF file of matplotlib, a line each, decoded by the tables of its fonts."""
+    objects = dict(re.findall(rb"(\d+) 0 obj\r?\n(.*?)\r?\nendobj", content, flags=re.DOTALL))
+
+    def stream(entry: bytes) -> bytes:
+        found = re.search(rb"stream\r?\n(.*?)\r?\nendstream", entry, flags=re.DOTALL)
+        return zlib.decompress(found[1]) if found and b"FlateDecode" in entry else b""
+
+    fonts = {}
+    for entry in objects.values():
+        for name, number in re.findall(rb"/(F\d+) (\d+) 0 R", entry if b"stream" not in entry else b""):
+            table = re.search(rb"/ToUnicode (\d+)", objects[number])
+            ranges = re.findall(rb"<(\w+)> <\w+> \[(.*?)\]", stream(objects[table[1]]))
+            fonts[name] = {
+                int(first, 16) + k: bytes.fromhex(code.decode()).decode("utf-16-be")
+                for first, codes in ranges
+                for k, code in enumerate(re.findall(rb"<(\w+)>", codes))
+            }
+    token = re.compile(rb"/(F\d+) [\d.]+ Tf|\(((?:[^()\\]|\\.)*)\)", re.DOTALL)
+    escapes = {b"n": b"\n", b"r": b"\r", b"t": b"\t", b"b": b"\b", b"f": b"\f"}
     pages = []
-    for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", content, flags=re.DOTALL):
-        try:
-            body = zlib.decompress(stream)
-        except zlib.error:
-            body = stream
-        if b" Tf" not in body:
-            continue
-        shown = re.findall(rb"\[((?:[^\]\\]|\\.)*)\] TJ|\(((?:[^)\\]|\\.)*)\) Tj", body)
-        lines = (b"".join(re.findall(rb"\(((?:[^)\\]|\\.)*)\)", kerned)) or plain for kerned, plain in shown)
-        pages.append("\n".join(re.sub(rb"\\([()\\])", rb"\1", line).decode("latin-1") for line in lines))
+    for body in filter(lambda body: b" Tf" in body, map(stream, objects.values())):
+        lines, font = [], b""
+        for block in re.findall(rb"BT\n(.*?)\nET", body, flags=re.DOTALL):
+            line = ""
+            for name, written in token.findall(block):
+                font = name or font
+                plain = re.sub(rb"\\(.)", lambda m: escapes.get(m[1], m[1]), written, flags=re.DOTALL)
+                line += "".join(
+                    fonts[font][256 * high + low] for high, low in zip(plain[::2], plain[1::2], strict=True)
+                )
+            lines.append(line)
+        pages.append("\n".join(lines))
     return pages
 
 

@@ -68,7 +68,10 @@ def results() -> dict[str, tuple]:
         "spot": (lambda: rt.spot(double, rings=4, **colours), "centroid_y rms_radius_um geometric_radius_um"),
         "spot of many rays": (lambda: rt.spot(double, rays=1000), "centroid_y rms_radius_um geometric_radius_um"),
         "focus": (lambda: rt.focus(double, object_distances=[3000]), "sensor_distance rms_radius_um"),
-        "compare_models": (lambda: rt.compare_models(single, object_distances=[10e3, 20e3]), "object_distance sigma_um difference"),
+        "compare_models": (
+            lambda: rt.compare_models(single, object_distances=[10e3, 20e3]),
+            "object_distance sigma_um difference",
+        ),
         "abilities": (lambda: compare.abilities(single), "conic anisotropy"),
         "psf": (
             lambda: rt.psf(single, "fourier", tol=1e-2),
