@@ -45,7 +45,7 @@ from raytrace.system.lens import Lens, field_points, with_wavelengths
 from raytrace.tracing.lens_report import FIRST_ORDER_LINES, Info
 from raytrace.words import RaytraceError, did_you_mean, option
 
-COLOURS, WIDTHS = ("#0072B2", "#D55E00"), (2.2, 1.1)  # of the first and the second lens, also where they coincide
+COLOURS, WIDTHS = ("#0072B2", "#D55E00"), (1.9, 1.0)  # of the first and the second lens, also where they coincide
 _HEADS = ("field_x", "field_y", "wavelength", "frequency", "radius", "pupil", "temperature", "quantity")
 _NO_VALUES = ("tangential_limit", "sagittal_limit", "rays", "projected_solid_angle", "noll", "coefficient")
 _ACROSS = 3  # panels in a row

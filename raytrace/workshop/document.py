@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 from raytrace.maths.result import Column, Columns, Result, cells
-from raytrace.plotting.style import Figure
+from raytrace.plotting.style import Figure, styled
 
 MOST_ROWS = 80  # of a table
 
@@ -28,10 +28,11 @@ class Heading:
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A figure and its description."""
+    """A figure and its description, and the caption that is set below it."""
 
     figure: Figure
     text: str
+    caption: str = ""
 
 
 #: A part of a section; a text is a paragraph.
@@ -57,6 +58,14 @@ class Document:
     lines: tuple[str, ...]
     sections: tuple[Section, ...]
     date: str = ""
+
+
+@styled
+def settled(figure: Figure) -> Figure:
+    """A figure whose parts have their final places: a second layout would move them again."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    return figure
 
 
 def grid_of(columns: Columns, result: Result | None = None) -> Grid:

@@ -16,7 +16,7 @@ ROOM = WIDTH - 2 * LEFT
 TALL = HEIGHT - TOP - BOTTOM
 _TEXT, _CELL, _LEAST = 8.5, 7.5, 4.5  # sizes of letters: paragraphs, tables, and the smallest of a wide table
 _PAD = 4.0  # at each side of a cell
-_BESIDE = 0.7  # least scale of two figures in one row
+_BESIDE = 0.62  # least scale of two figures in one row
 _TOGETHER = 4  # rows of a table that stay with its head
 _WHOLE = 0.35  # of a page: shorter tables are not divided
 _SHRUNK, _FILLING = 0.8, 0.7  # least scales of a figure at the end of a page, and of figures that fill one
@@ -119,7 +119,8 @@ def _shrunk(piece: _Piece, factor: float) -> _Piece:
     pictures = []
     for figure, x, y, scale in piece.pictures:
         pictures.append((figure, 0.5 * ROOM + factor * (x - 0.5 * ROOM), factor * y, factor * scale))
-    return dataclasses.replace(piece, height=factor * piece.height, pictures=pictures)
+    texts = [(0.5 * ROOM + factor * (x - 0.5 * ROOM), factor * y, text, look) for x, y, text, look in piece.texts]
+    return dataclasses.replace(piece, height=factor * piece.height, pictures=pictures, texts=texts)
 
 
 def _front(document: Document) -> _Piece:
@@ -204,10 +205,13 @@ def _pictures(pictures: Sequence[Picture]) -> list[_Piece]:
         scale = _scale(row)
         sizes = [72 * scale * size for picture in row for size in [picture.figure.get_size_inches()]]
         height = max(size[1] for size in sizes)
-        piece = _Piece(height + 12)
+        below = 14 if any(picture.caption for picture in row) else 0
+        piece = _Piece(height + 12 + below)
         x = 0.5 * (ROOM - sum(size[0] for size in sizes) - 10 * (len(row) - 1))
         for picture, size in zip(row, sizes, strict=True):
             piece.pictures.append((picture.figure, x, 4 + 0.5 * (height - size[1]), scale))
+            look: dict[str, Any] = {"fontsize": _TEXT, "ha": "center"}
+            piece.texts += [(x + 0.5 * size[0], height + 12, picture.caption, look)] if picture.caption else []
             x += size[0] + 10
         pieces.append(piece)
     factor = (TALL - _HEAD) / max(sum(piece.height for piece in pieces), 1.0)
@@ -216,8 +220,8 @@ def _pictures(pictures: Sequence[Picture]) -> list[_Piece]:
 
 def _scale(row: Sequence[Picture]) -> float:
     sizes = [72 * picture.figure.get_size_inches() for picture in row]
-    wide, tall = sum(size[0] for size in sizes) + 10 * (len(row) - 1), max(size[1] for size in sizes)
-    return min(1.0, ROOM / wide, (TALL - 60) / tall)
+    wide, tall = sum(size[0] for size in sizes), max(size[1] for size in sizes)
+    return min(1.0, (ROOM - 10 * (len(row) - 1)) / wide, (TALL - 60) / tall)
 
 
 # -- tables
@@ -356,6 +360,7 @@ def _inset(page: style.Figure, drawn: style.Figure, x: float, top: float, scale:
     """
     from matplotlib.artist import Artist
     from matplotlib.backends.backend_pdf import FigureCanvasPdf, Op
+    from matplotlib.collections import QuadMesh
 
     class Inset(Artist):
         def draw(self, renderer: Any) -> None:
@@ -363,6 +368,8 @@ def _inset(page: style.Figure, drawn: style.Figure, x: float, top: float, scale:
             before, canvas = drawn.dpi, drawn.canvas
             for part in drawn.findobj(Artist.get_rasterized):
                 part.set_rasterized(False)  # the page would place the pixels without the scale
+                if isinstance(part, QuadMesh):  # no gaps between the shades of a scale of colours
+                    part.set(edgecolor="face", linewidth=0.3)
             FigureCanvasPdf(drawn)
             drawn.dpi = 72
             renderer.file.output(*renderer.gc.finalize())

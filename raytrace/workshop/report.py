@@ -43,7 +43,17 @@ from raytrace.tolerancing.files import tolerances_of
 from raytrace.tolerancing.grades import tolerances
 from raytrace.tracing.lens_report import Info, info
 from raytrace.words import RaytraceError, RaytraceWarning, did_you_mean, option
-from raytrace.workshop.document import Block, Document, Heading, Picture, Section, grid_of, rows_grid, tables_of
+from raytrace.workshop.document import (
+    Block,
+    Document,
+    Heading,
+    Picture,
+    Section,
+    grid_of,
+    rows_grid,
+    settled,
+    tables_of,
+)
 from raytrace.workshop.pages import pdf
 from raytrace.workshop.sheets import draw
 from raytrace.workshop.web import page
@@ -127,16 +137,16 @@ class _Writer:
         self.documents: list[dict[str, Any]] = []
         self.gaps: list[str] = []
 
-    def analysis(self, name: str, make: Callable[[], Result], *, tables: bool = True, figure: bool = True) -> None:
-        """A result with its tables and its figure, or the reason why there is none."""
+    def analysis(self, name: str, make: Callable[[], Result], *, tables: bool = True, caption: str = "") -> None:
+        """A result with its figure and its tables, or the reason why there is none."""
         try:
             result = make()
-            pictures = [Picture(result.draw(), name)] if figure else []
+            picture = Picture(settled(result.draw()), name, caption)
             blocks = tables_of(result) if tables else []
         except (RaytraceError, ValueError) as error:
             self.gaps.append(f"{name}: {error}")
             return
-        self.blocks += [*pictures, *blocks]
+        self.blocks += [picture, *blocks]
         self.documents.append(result.document())
 
 
@@ -219,14 +229,15 @@ def _of(request: _Request, lens: Lens) -> str:
 
 
 def _layout(request: _Request, writer: _Writer) -> None:
-    if len(request.lenses) > 1:
-        together = request.lens
-        writer.analysis(
-            "All configurations", lambda: layout(together, configuration=ALL, **request.at_fields), tables=False
-        )
+    several = len(request.lenses) > 1
+    if several:
+        whole = request.lens
+        name = "All configurations"
+        writer.analysis(name, lambda: layout(whole, configuration=ALL, **request.at_fields), tables=False, caption=name)
     for lens in request.lenses:
-        name = f"Configuration {lens.current_configuration}" if len(request.lenses) > 1 else "Layout"
-        writer.analysis(name, lambda lens=lens: layout(lens, **request.at_fields), tables=False)
+        name = f"Configuration {lens.current_configuration}" if several else "Layout"
+        caption = name if several else ""
+        writer.analysis(name, lambda lens=lens: layout(lens, **request.at_fields), tables=False, caption=caption)
 
 
 def _each(

@@ -34,6 +34,7 @@ th small { color: #5a5a5a; font-weight: normal; font-size: .75rem; }
 tbody tr:nth-child(even) { background: #f6f7f8; }
 figure { display: inline-block; max-width: 100%; margin: .6rem 1rem .6rem 0; }
 figure img { max-width: 100%; height: auto; }
+figcaption { text-align: center; }
 footer { margin-top: 3rem; font-size: .8rem; border-top: 1px solid #d0d0d0; padding-top: .5rem; }
 @media print { body { max-width: none; } h2, h3 { break-after: avoid; } figure, tr { break-inside: avoid; } }
 """
@@ -88,9 +89,9 @@ def _block(block: Block) -> str:
     if isinstance(block, Grid):
         return _table(block)
     if isinstance(block, Picture):
-        return (
-            f'<figure><img src="{_source(block.figure)}"{_size(block.figure)} alt="{html.escape(block.text)}"></figure>'
-        )
+        caption = f"<figcaption>{html.escape(block.caption)}</figcaption>" if block.caption else ""
+        picture = f'<img src="{_source(block.figure)}"{_size(block.figure)} alt="{html.escape(block.text)}">'
+        return f"<figure>{picture}{caption}</figure>"
     return f"<p>{html.escape(block)}</p>"
 
 
