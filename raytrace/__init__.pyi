@@ -29,6 +29,7 @@ from raytrace.analysis.fans import ray_fan as ray_fan
 from raytrace.analysis.focus_report import NoFocus as NoFocus
 from raytrace.analysis.focus_report import VirtualImage as VirtualImage
 from raytrace.analysis.focus_report import focus as focus
+from raytrace.analysis.footprint import footprint as footprint
 from raytrace.analysis.grid import distortion_grid as distortion_grid
 from raytrace.analysis.illumination import relative_illumination as relative_illumination
 from raytrace.analysis.incidence import incidence as incidence
@@ -43,6 +44,7 @@ from raytrace.analysis.setting import NothingToShow as NothingToShow
 from raytrace.analysis.sheared_batch import ClippedBeam as ClippedBeam
 from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.thermal import thermal as thermal
+from raytrace.analysis.vignetting import vignetting as vignetting
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong

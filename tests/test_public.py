@@ -355,6 +355,7 @@ def assert_alike(one, other) -> None:
 NEEDED = {
     "jacobian": {"vary": "curvature:1"},
     "sag": {"surface": 3},
+    "footprint": {"surface": 3},
     "tolerance": {"limits": "radius=0.1%", "trials": 20},
 }
 
@@ -515,6 +516,7 @@ ANALYSES = (
     ("field_curvature", {"fields": [5, 9]}, "--fields 5 9", "sagittal", "mm"),
     ("lateral_colour", {"wavelengths": [0.5, 0.6], "samples": 3}, "--wavelengths 0.5 0.6 --samples 3", "shift", "µm"),
     ("relative_illumination", {"fields": [3, 9]}, "--field 3 9", "illumination", "sr"),
+    ("vignetting", {"fields": [3, 9]}, "--field 3 9", "passed_percent", "factors"),
     ("seidel", {"fields": [9], "kind": "waves"}, "--field 9 --kind waves", "W040", "optical invariant"),
     ("longitudinal_aberration", {"points": 5, "wavelengths": [0.55]}, "--points 5 --wavelength 0.55", "crossing", "mm"),
     (

@@ -9,6 +9,8 @@
 | encircled_energy                            | light within a radius, of diffraction or of rays               |
 | distortion, field_curvature, lateral_colour | from chief rays and close rays around them                     |
 | relative_illumination                       | light of a field against the axis                              |
+| vignetting                                  | light cut over the field, and the surfaces that cut it         |
+| footprint                                   | beams on a surface with its apertures                          |
 | rms_over_field                              | RMS wavefront or spot, each wavelength and all together        |
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |

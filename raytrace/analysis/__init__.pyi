@@ -7,6 +7,7 @@ from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan
 from raytrace.analysis.focus_report import focus as focus
+from raytrace.analysis.footprint import footprint as footprint
 from raytrace.analysis.grid import distortion_grid as distortion_grid
 from raytrace.analysis.illumination import relative_illumination as relative_illumination
 from raytrace.analysis.incidence import incidence as incidence
@@ -18,4 +19,5 @@ from raytrace.analysis.sag_table import sag as sag
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.thermal import thermal as thermal
+from raytrace.analysis.vignetting import vignetting as vignetting
 from raytrace.analysis.wavefronts import wavefront as wavefront

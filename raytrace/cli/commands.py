@@ -137,6 +137,9 @@ _WAVE_FIGURES = {
 }
 
 
+RIMS = switch("rims", "the semi-diameters as apertures instead of the vignetting factors")
+
+
 class Step(argparse.Action):
     """An edit: its name and its words are appended to `steps`, in the order of the command line."""
 
@@ -809,6 +812,35 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         double_gauss --field 0 10 14 --json""",
         *LENS, CONDITIONS, plot("the curves"), TABLE,
         "fields", "samples",
+    ),
+    _command(
+        "vignetting",
+        "vignetting over the field: what cuts the light where",
+        "Share of the entrance pupil whose light reaches the sensor over the field, and the share that each surface, "
+        "and the vignetting factors of the lens, cut. Semi-diameters clip no ray, only apertures do; --rims takes the "
+        "semi-diameters, as `info` prints them, as apertures instead of the vignetting factors.",
+        """
+        double_gauss_28deg --rims --plot vignetting.png
+        hubble --field 0 0.08 --json
+        retrofocus --ray-aiming off --rims --samples 6 -o vignetting.csv""",
+        *LENS, CONDITIONS, plot("the shares over the field"), TABLE,
+        "fields", "samples", RIMS,
+    ),
+    _command(
+        "footprint",
+        "beams on a surface with its aperture",
+        "Where the beams of all fields and wavelengths meet a surface, in its own axes: extent, centroid, largest "
+        "distance from the vertex, the share that the apertures of the surface pass, and the share of the entrance "
+        "pupil that reaches the sensor. The figure shows the rims of the beams, and the apertures.",
+        """
+        double_gauss_28deg 8 --rims --plot footprint.png
+        folded_relay 3 --clipped -o footprint.csv
+        scan_lens 7 --configuration all --plot footprint.png
+        hubble 2 --field 0.08 --wavelength 0.55 --json""",
+        "lens", Option("surface", count, "SURFACE", "number of the surface", flag="surface"),
+        row("configuration", f"{OPTIONS['configuration'].help}; all: one after the other", reader=count_or_all),
+        *LENS[2:], CONDITIONS, plot("the beams and apertures"), TABLE, "fields",
+        switch("clipped", "only rays that reach the sensor, not all that reach the surface"), RIMS,
     ),
     _command(
         "seidel",
