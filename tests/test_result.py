@@ -60,6 +60,10 @@ def results() -> dict[str, tuple]:
             lambda: rt.footprint(double, 3, **fields),
             "x_low x_high y_low y_high centroid_y reach passed_percent",
         ),
+        "intercepts": (
+            lambda: rt.intercepts(double, each=True, **fields),
+            "x y z l m n incidence refraction",
+        ),
         "longitudinal": (lambda: rt.longitudinal_aberration(double, points=5), "crossing"),
         "mtf": (lambda: rt.mtf(double, frequencies=[10, 20], geometric=True), "tangential sagittal"),
         "through_focus": (

@@ -18,6 +18,7 @@
 | thermal                                     | focus, spot and MTF over temperature                           |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
+| intercepts                                  | named rays at every surface, the largest heights and angles    |
 | sag                                         | sag, slope, aspheric departure, best-fit sphere of a surface   |
 | compare, abilities                          | PSF models, and the properties that each can represent         |
 

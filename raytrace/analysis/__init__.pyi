@@ -11,6 +11,7 @@ from raytrace.analysis.footprint import footprint as footprint
 from raytrace.analysis.grid import distortion_grid as distortion_grid
 from raytrace.analysis.illumination import relative_illumination as relative_illumination
 from raytrace.analysis.incidence import incidence as incidence
+from raytrace.analysis.intercepts import intercepts as intercepts
 from raytrace.analysis.layout import layout as layout
 from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import mtf as mtf

@@ -916,6 +916,22 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         "fields", "samples", switch("surfaces", "list every surface in the text, not only the sensor"),
     ),
     _command(
+        "intercepts",
+        "named rays at every surface, and their largest heights and angles",
+        "Where the chief ray and the rays on the rim of the beam of each field meet every surface: the largest height "
+        "and angles of incidence and refraction at each surface over all fields, wavelengths and rays, with the field "
+        "and the ray; --each, --json and -o also list every ray: point, direction cosines behind the surface and "
+        "angles, in the axes of each surface.",
+        """
+        double_gauss --plot angles.png
+        phone --field 0 20 37 --wavelength 0.4861 0.6563 -o rays.csv
+        spectrometer --rays chief --each""",
+        *LENS, CONDITIONS, plot("the largest angles by surface"), TABLE, "fields",
+        Option("rays", None, "NAME", "chief, upper and lower (on the rim of the beam along the direction of the "
+            "field), right and left (across it); default all", nargs="+", default=""),
+        switch("each", "list every ray in the text"),
+    ),
+    _command(
         "sag",
         "sag table of a surface, best-fit sphere, aspheric departure",
         "Sag and slope of a surface over the radius, and its departure from the vertex sphere and from the best-fit "
