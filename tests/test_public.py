@@ -528,6 +528,7 @@ ANALYSES = (
     ),
     ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
+    ("depth_of_field", {"blur": 0.1}, "--blur 0.1", "near", "hyperfocal"),
     ("intercepts", {"fields": [3, 9], "rays": ["chief", "upper"]}, "--field 3 9 --rays chief upper", "x", "height"),
     ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms_um", "all, weighted"),
     ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "tangential_limit", "1/mm"),

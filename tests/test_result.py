@@ -61,8 +61,12 @@ def results() -> dict[str, tuple]:
             "x_low x_high y_low y_high centroid_y reach passed_percent",
         ),
         "intercepts": (
-            lambda: rt.intercepts(double, each=True, **fields),
+            lambda: rt.intercepts(double, each=True, rays="chief upper", **fields),
             "x y z l m n incidence refraction",
+        ),
+        "depth of field": (
+            lambda: rt.depth_of_field(double.at(object_distance=3000), blur=3.5),
+            "near far depth blur_um",
         ),
         "longitudinal": (lambda: rt.longitudinal_aberration(double, points=5), "crossing"),
         "mtf": (lambda: rt.mtf(double, frequencies=[10, 20], geometric=True), "tangential sagittal"),

@@ -16,6 +16,7 @@
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
 | thermal                                     | focus, spot and MTF over temperature                           |
+| depth_of_field                              | near and far limits of sharpness, hyperfocal distance          |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
 | intercepts                                  | named rays at every surface, the largest heights and angles    |

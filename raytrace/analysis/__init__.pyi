@@ -3,6 +3,7 @@ from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
 from raytrace.analysis.chromatic import chromatic_focal_shift as chromatic_focal_shift
 from raytrace.analysis.compare import compare as compare
+from raytrace.analysis.depth_of_field import depth_of_field as depth_of_field
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan

@@ -202,7 +202,9 @@ def footprint(
         raise ValueError(f"surface {surface} {kind}; expected a surface that light meets, from 1 to {last}")
     if isinstance(configuration, str) and configuration != ALL:
         raise ValueError(f"{option('configuration', configuration)}: expected a number from 1, or {ALL}")
-    if configuration == ALL:
+    lenses: tuple[Lens, ...]
+    numbers: tuple[int, ...]
+    if isinstance(configuration, str):
         lenses, numbers = lens.configurations, tuple(range(1, len(lens.configurations) + 1))
     else:
         number = lens.current_configuration if configuration is None else configuration

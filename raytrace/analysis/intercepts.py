@@ -109,7 +109,8 @@ class Intercepts(Analysis):
         return plain(document)
 
     def tables(self) -> list[Table]:
-        rays, columns = self._rays_of_largest(), {}
+        rays = self._rays_of_largest()
+        columns: dict[str, Tensor | Sequence[str]] = {}
         for name, values in self.summary().items():
             columns[name] = values
             quantity, _, rest = name.partition("_")
@@ -127,7 +128,7 @@ class Intercepts(Analysis):
         panel.bar(k - 0.2, np.nan_to_num(table["incidence"]), 0.4, color=field_colour(0), label="incidence")
         panel.bar(k + 0.2, np.nan_to_num(table["refraction"]), 0.4, color=field_colour(2), label="refraction")
         panel.axhline(0, color=GREY, linewidth=0.6)
-        panel.xaxis.get_major_locator().set_params(integer=True)
+        panel.set_xticks([*map(int, k)])
         return finished(panel, self, "angles of incidence and refraction", 2)
 
 

@@ -894,6 +894,24 @@ interpolated. -o names a file, or a folder for several pictures, which share the
         Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
     ),
     _command(
+        "depth-of-field",
+        "near and far limits of sharpness, hyperfocal distance",
+        "Object distances that are sharp with the sensor where it is, the hyperfocal distance and the depth of focus, "
+        "by traced rays and by the paraxial formulas. Sharp is a blur (circle of confusion) up to --blur, a modulation "
+        "from --modulation at --modulation-frequency, or an RMS wavefront up to --wavefront, by default that of a "
+        "quarter wave of defocus. Distances are measured to surface 1; inf: infinity is sharp.",
+        """
+        double_gauss --blur 0.03 --plot depth.png
+        lens.zmx --object-distance 3000 --sensor-distance 52.1 --modulation 0.3 --modulation-frequency 40
+        double_gauss --field 0 10 --blur 0.05 --json""",
+        *LENS, CONDITIONS, plot("the criterion over the object distance"), TABLE,
+        Option("blur", positive_finite, "MM", "largest diameter of the blur"),
+        Option("modulation", positive_finite, "M", "least modulation, tangential and sagittal"),
+        Option("modulation_frequency", positive_finite, "F", "of the modulation, cycles/mm"),
+        Option("wavefront", positive_finite, "WAVES", "largest RMS wavefront (default 0.0722)"),
+        row("fields", f"{OPTIONS['fields'].help} (default: the axis)"),
+    ),
+    _command(
         "distortion-grid",
         "grid distortion",
         "Image of a square grid of object points up to the largest field, compared with its ideal image.",
