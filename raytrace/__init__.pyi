@@ -25,15 +25,18 @@ from raytrace.analysis.chromatic import chromatic_focal_shift as chromatic_focal
 from raytrace.analysis.compare import Incomparable as Incomparable
 from raytrace.analysis.compare import compare as compare
 from raytrace.analysis.compare_models import compare_models as compare_models
+from raytrace.analysis.depth_of_field import depth_of_field as depth_of_field
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan
 from raytrace.analysis.focus_report import NoFocus as NoFocus
 from raytrace.analysis.focus_report import VirtualImage as VirtualImage
 from raytrace.analysis.focus_report import focus as focus
+from raytrace.analysis.footprint import footprint as footprint
 from raytrace.analysis.grid import distortion_grid as distortion_grid
 from raytrace.analysis.illumination import relative_illumination as relative_illumination
 from raytrace.analysis.incidence import incidence as incidence
+from raytrace.analysis.intercepts import intercepts as intercepts
 from raytrace.analysis.layout import layout as layout
 from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import mtf as mtf
@@ -45,6 +48,7 @@ from raytrace.analysis.setting import NothingToShow as NothingToShow
 from raytrace.analysis.sheared_batch import ClippedBeam as ClippedBeam
 from raytrace.analysis.spot_diagram import spot as spot
 from raytrace.analysis.thermal import thermal as thermal
+from raytrace.analysis.vignetting import vignetting as vignetting
 from raytrace.analysis.wavefronts import wavefront as wavefront
 from raytrace.budget import OverBudget as OverBudget
 from raytrace.budget import TakesLong as TakesLong

@@ -340,6 +340,33 @@ def test_energy_of_kernels(lens):
     assert close(rt.psf(lens, rt.psf_models.DRT(order=5), **window).energy[0], share, abs=2e-2)
 
 
+@quiet
+def test_light_that_passes(lens):
+    """One share of the entrance pupil by `vignetting`, `footprint` and the rays of `spot`; of a slow lens also by
+    `relative_illumination`: below."""
+    lens = lens.at(wavelengths=lens.primary[None])
+    fields = own_fields(lens)
+    share = rt.vignetting(lens, fields=fields).passed
+    last = len(lens.surfaces) - 1
+    assert close(rt.footprint(lens, last, fields=fields).passed_by_lens[0, :, 0], share, rel=1e-9)
+    spots = rt.spot(lens, rings=48)
+    counted = torch.where(spots.arrivals.rays.valid, spots.arrivals.weight, 0.0).sum(-1)[:, 0]
+    assert close(share, counted * beam_share(scene_of(lens, fields))[0, :, 0], abs=5e-3)
+
+
+@quiet
+def test_light_that_passes_and_illumination():
+    """In a slow lens solid angles are areas of the pupil: apertures cut the same share of both."""
+    whole = _triplet(f_number=40, wavelengths=[0.5876], fields=[0, 8]).at(ray_aiming="off")
+    whole = dataclasses.replace(whole, fields=dataclasses.replace(whole.fields, vignetting=None))
+    rim = rt.system.Aperture("circular", (0.0, 0.8), centre=(0.0, -0.2))
+    clipped = whole.replace(whole.stop, apertures=(rim,))
+    angles = [rt.relative_illumination(each, fields=[0, 8]).projected_solid_angle for each in (clipped, whole)]
+    share = rt.vignetting(clipped, fields=[0, 8]).passed
+    assert bool((share < 0.99).all())
+    assert close(angles[0] / angles[1], share, rel=2e-3)
+
+
 # -- wavefronts -------------------------------------------------------------------------------------------------------
 
 

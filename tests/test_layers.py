@@ -17,7 +17,10 @@ COMMANDS = re.compile(r"cli(\.|$)")
 #: The value of a lower layer is shown by a higher one, and a lens at another temperature has edges where rays reach:
 #: the only imports against the layers, inside methods.
 SHOWN_BY = {
-    "system.lens": ("tracing.lens_report", "tracing.geometry", "analysis.layout", "optimization.conditions"),
+    "system.lens": (
+        *("tracing.lens_report", "tracing.geometry", "tracing.paraxial", "analysis.layout"),
+        "optimization.conditions",
+    ),
     "tracing.lens_report": ("optimization.attained",),
     "psf_models.result": ("psf_models.figures",),
     "optimization.optimized": ("optimization.optimized_figure",),

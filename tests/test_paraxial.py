@@ -322,3 +322,50 @@ def test_first_order_data_are_a_table_with_a_row_for_each_wavelength():
     assert frame["effective_focal_length"].tolist() == found.effective_focal_length.tolist()
     assert frame["f_number"].tolist() == found.f_number.tolist()
     assert len(first_order(triplet).to_frame()) == 1
+
+
+# -- conjugates of a magnification -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["double_gauss", "cooke_triplet", "telephoto", "hubble"])
+@pytest.mark.parametrize("magnification", [-0.001, -0.1, -1.0, -3.0])
+def test_a_lens_has_the_magnification_that_is_specified(name, magnification):
+    """Newton's equations: m = -f/x, x the distance of the object from the front focal point, and x' = -f m."""
+    before = rt.read_lens(name)
+    found, data = before.at(magnification=magnification), first_order(before)
+    assert float(first_order(found).magnification) == pytest.approx(magnification, rel=1e-11)
+    focal, side = abs(float(data.effective_focal_length)), math.copysign(1.0, float(before.surfaces[-2].thickness))
+    distance = -focal / magnification - float(data.front_focal_distance)
+    assert float(found.surfaces[0].thickness) == pytest.approx(distance, rel=1e-11)
+    image = float(data.back_focal_distance) - side * focal * magnification
+    assert float(found.surfaces[-2].thickness) == pytest.approx(image, rel=1e-11)
+    kept = before.at(magnification=magnification, sensor_distance=50.0)
+    assert float(kept.surfaces[-2].thickness) == 50.0
+    assert torch.equal(kept.surfaces[0].thickness, found.surfaces[0].thickness)
+
+
+def test_conjugates_of_a_magnification_have_derivatives():
+    def distances(curvature, magnification):
+        lens = thick_lens().replace(1, curvature=curvature).at(magnification=magnification)
+        return torch.stack([lens.surfaces[0].thickness, lens.surfaces[-2].thickness])
+
+    gradcheck(distances, (scalar(0.02).requires_grad_(), scalar(-0.4).requires_grad_()))
+
+
+def test_magnifications_that_no_real_object_has_are_refused(capsys):
+    lens = thick_lens()
+    with pytest.raises(
+        ValueError, match=r"an object at .* mm, whose image, at .* mm, is virtual; .* have negative ones"
+    ):
+        lens.at(magnification=3.0)
+    with pytest.raises(ValueError, match="behind surface 1"):
+        lens.at(magnification=0.5)
+    with pytest.raises(ValueError, match="a number other than 0"):
+        lens.at(magnification=0.0)
+    with pytest.raises(ValueError, match="exclude each other"):
+        lens.at(magnification=-1, object_distance=100)
+    assert main(["info", "singlet", "--magnification", "2", "--json"]) == 1
+    assert "is virtual" in capsys.readouterr().err
+    assert main(["info", "singlet", "--magnification", "-0.5", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["magnification"] == pytest.approx(-0.5, rel=1e-12)

@@ -355,6 +355,7 @@ def assert_alike(one, other) -> None:
 NEEDED = {
     "jacobian": {"vary": "curvature:1"},
     "sag": {"surface": 3},
+    "footprint": {"surface": 3},
     "tolerance": {"limits": "radius=0.1%", "trials": 20},
 }
 
@@ -518,6 +519,7 @@ ANALYSES = (
     ("field_curvature", {"fields": [5, 9]}, "--fields 5 9", "sagittal", "mm"),
     ("lateral_colour", {"wavelengths": [0.5, 0.6], "samples": 3}, "--wavelengths 0.5 0.6 --samples 3", "shift", "µm"),
     ("relative_illumination", {"fields": [3, 9]}, "--field 3 9", "illumination", "sr"),
+    ("vignetting", {"fields": [3, 9]}, "--field 3 9", "passed_percent", "factors"),
     ("seidel", {"fields": [9], "kind": "waves"}, "--field 9 --kind waves", "W040", "optical invariant"),
     ("longitudinal_aberration", {"points": 5, "wavelengths": [0.55]}, "--points 5 --wavelength 0.55", "crossing", "mm"),
     (
@@ -529,6 +531,8 @@ ANALYSES = (
     ),
     ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
+    ("depth_of_field", {"blur": 0.1}, "--blur 0.1", "near", "hyperfocal"),
+    ("intercepts", {"fields": [3, 9], "rays": ["chief", "upper"]}, "--field 3 9 --rays chief upper", "x", "height"),
     ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms_um", "all, weighted"),
     ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "tangential_limit", "1/mm"),
     (

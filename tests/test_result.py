@@ -52,6 +52,22 @@ def results() -> dict[str, tuple]:
         "distortion_grid": (lambda: rt.distortion_grid(double, points=3), "distortion_percent"),
         "illumination": (lambda: rt.relative_illumination(double, samples=3), "illumination projected_solid_angle"),
         "incidence": (lambda: rt.incidence(double, samples=3, surfaces=True), "lower chief upper"),
+        "vignetting": (
+            lambda: rt.vignetting("double_gauss_28deg", rims=True, samples=2, wavelengths=[0.55]),
+            "passed_percent surface_7_percent",
+        ),
+        "footprint": (
+            lambda: rt.footprint(double, 3, **fields),
+            "x_low x_high y_low y_high centroid_y reach passed_percent",
+        ),
+        "intercepts": (
+            lambda: rt.intercepts(double, each=True, rays="chief upper", **fields),
+            "x y z l m n incidence refraction",
+        ),
+        "depth of field": (
+            lambda: rt.depth_of_field(double.at(object_distance=3000), blur=3.5),
+            "near far depth blur_um",
+        ),
         "longitudinal": (lambda: rt.longitudinal_aberration(double, points=5), "crossing"),
         "mtf": (lambda: rt.mtf(double, frequencies=[10, 20], geometric=True), "tangential sagittal"),
         "through_focus": (

@@ -9,13 +9,17 @@
 | encircled_energy                            | light within a radius, of diffraction or of rays               |
 | distortion, field_curvature, lateral_colour | from chief rays and close rays around them                     |
 | relative_illumination                       | light of a field against the axis                              |
+| vignetting                                  | light cut over the field, and the surfaces that cut it         |
+| footprint                                   | beams on a surface with its apertures                          |
 | rms_over_field                              | RMS wavefront or spot, each wavelength and all together        |
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
 | chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
 | thermal                                     | focus, spot and MTF over temperature                           |
+| depth_of_field                              | near and far limits of sharpness, hyperfocal distance          |
 | distortion_grid                             | image of a square grid of object points                        |
 | incidence                                   | angles at which beams meet every surface and the sensor        |
+| intercepts                                  | named rays at every surface, the largest heights and angles    |
 | sag                                         | sag, slope, aspheric departure, best-fit sphere of a surface   |
 | compare, abilities                          | PSF models, and the properties that each can represent         |
 

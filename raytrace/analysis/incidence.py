@@ -94,7 +94,7 @@ def incidence(
 
 
 def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Incidence:
-    along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), against (F, W, P)
+    along = field_directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), against (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     along = torch.cat([along, torch.zeros_like(along[:1])])
     angles, arrive, reached = [], [], rays.valid
@@ -102,7 +102,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     gap = None
     for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
-        direction, along = (_in_axes_of(surface, gap, vector) for vector in (rays.direction, along))
+        direction, along = (in_axes_of(surface, gap, vector) for vector in (rays.direction, along))
         angles.append(_angle(surface, direction, crossing.rays.position, along))
         rays, gap = crossing.rays, gap_behind(surface)
         if surface.is_break:
@@ -121,7 +121,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     )
 
 
-def _directions(lens: Lens, fields: Tensor) -> Tensor:
+def field_directions(lens: Lens, fields: Tensor) -> Tensor:
     """Unit vectors (2, F) across the axis, from it towards the fields; +y for the axis."""
     x, y = torch.tan(torch.deg2rad(fields)) if lens.fields.kind == "angle" else fields
     length = torch.hypot(x, y)
@@ -130,7 +130,7 @@ def _directions(lens: Lens, fields: Tensor) -> Tensor:
     return torch.stack([x / length, torch.where(on_axis, 1.0, y / length)])
 
 
-def _in_axes_of(surface: Surface, gap: Tensor | Gap | None, vector: Tensor) -> Tensor:
+def in_axes_of(surface: Surface, gap: Tensor | Gap | None, vector: Tensor) -> Tensor:
     """A direction (3, ...) behind the surface before, in the axes of this one."""
     for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
         if pose is not None:

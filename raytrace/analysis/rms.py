@@ -75,7 +75,7 @@ class RmsOverField(OverField):
         return [Table({**summary, **self.by_wavelength(rms, self.column(name).unit), **strehl})]
 
     def at(self, fields: Tensor) -> "RmsOverField":
-        return _rms(self.lens, fields, self.quantity == "spot", self.reference, self.pupil)
+        return rms_of_fields(self.lens, fields, self.quantity == "spot", self.reference, self.pupil)
 
     @styled
     def draw(self) -> Figure:
@@ -122,10 +122,13 @@ def rms_over_field(
     if reference not in REFERENCES:
         raise ValueError(f"reference {reference!r}: expected one of {', '.join(REFERENCES)}")
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
-    return _rms(lens, fields, spot, reference, pupil)
+    return rms_of_fields(lens, fields, spot, reference, pupil)
 
 
-def _rms(lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor] | None) -> RmsOverField:
+def rms_of_fields(
+    lens: Lens, fields: Tensor, spot: bool, reference: str, pupil: tuple[Tensor, Tensor] | None = None
+) -> RmsOverField:
+    """As `rms_over_field` of fields (2, F) of a lens that is set and whose rays are known to arrive."""
     shares = wavelength_shares(lens)
     if spot:
         rings = SAMPLINGS["gauss"][2]  # as of `spot`

@@ -139,6 +139,9 @@ _WAVE_FIGURES = {
 }
 
 
+RIMS = switch("rims", "the semi-diameters as apertures instead of the vignetting factors")
+
+
 class Step(argparse.Action):
     """An edit: its name and its words are appended to `steps`, in the order of the command line."""
 
@@ -875,6 +878,35 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         "fields", "samples",
     ),
     _command(
+        "vignetting",
+        "vignetting over the field: what cuts the light where",
+        "Share of the entrance pupil whose light reaches the sensor over the field, and the share that each surface, "
+        "and the vignetting factors of the lens, cut. Semi-diameters clip no ray, only apertures do; --rims takes the "
+        "semi-diameters, as `info` prints them, as apertures instead of the vignetting factors.",
+        """
+        double_gauss_28deg --rims --plot vignetting.png
+        hubble --field 0 0.08 --json
+        retrofocus --ray-aiming off --rims --samples 6 -o vignetting.csv""",
+        *LENS, CONDITIONS, plot("the shares over the field"), TABLE,
+        "fields", "samples", RIMS,
+    ),
+    _command(
+        "footprint",
+        "beams on a surface with its aperture",
+        "Where the beams of all fields and wavelengths meet a surface, in its own axes: extent, centroid, largest "
+        "distance from the vertex, the share that the apertures of the surface pass, and the share of the entrance "
+        "pupil that reaches the sensor. The figure shows the rims of the beams, and the apertures.",
+        """
+        double_gauss_28deg 8 --rims --plot footprint.png
+        folded_relay 3 --clipped -o footprint.csv
+        scan_lens 7 --configuration all --plot footprint.png
+        hubble 2 --field 0.08 --wavelength 0.55 --json""",
+        "lens", Option("surface", count, "SURFACE", "number of the surface", flag="surface"),
+        row("configuration", f"{OPTIONS['configuration'].help}; all: one after the other", reader=count_or_all),
+        *LENS[2:], CONDITIONS, plot("the beams and apertures"), TABLE, "fields",
+        switch("clipped", "only rays that reach the sensor, not all that reach the surface"), RIMS,
+    ),
+    _command(
         "seidel",
         "Seidel aberrations by surface",
         "Third-order aberrations S1 to S5 (spherical, coma, astigmatism, Petzval, distortion), C1, C2 (axial, lateral "
@@ -926,6 +958,24 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
     ),
     _command(
+        "depth-of-field",
+        "near and far limits of sharpness, hyperfocal distance",
+        "Object distances that are sharp with the sensor where it is, the hyperfocal distance and the depth of focus, "
+        "by traced rays and by the paraxial formulas. Sharp is a blur (circle of confusion) up to --blur, a modulation "
+        "from --modulation at --modulation-frequency, or an RMS wavefront up to --wavefront, by default that of a "
+        "quarter wave of defocus. Distances are measured to surface 1; inf: infinity is sharp.",
+        """
+        double_gauss --blur 0.03 --plot depth.png
+        lens.zmx --object-distance 3000 --sensor-distance 52.1 --modulation 0.3 --modulation-frequency 40
+        double_gauss --field 0 10 --blur 0.05 --json""",
+        *LENS, CONDITIONS, plot("the criterion over the object distance"), TABLE,
+        Option("blur", positive_finite, "MM", "largest diameter of the blur"),
+        Option("modulation", positive_finite, "M", "least modulation, tangential and sagittal"),
+        Option("modulation_frequency", positive_finite, "F", "of the modulation, cycles/mm"),
+        Option("wavefront", positive_finite, "WAVES", "largest RMS wavefront (default 0.0722)"),
+        row("fields", f"{OPTIONS['fields'].help} (default: the axis)"),
+    ),
+    _command(
         "distortion-grid",
         "grid distortion",
         "Image of a square grid of object points up to the largest field, compared with its ideal image.",
@@ -946,6 +996,22 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         double_gauss --field 0 14 --surfaces --json""",
         *LENS, CONDITIONS, plot("the curves"), TABLE,
         "fields", "samples", switch("surfaces", "list every surface in the text, not only the sensor"),
+    ),
+    _command(
+        "intercepts",
+        "named rays at every surface, and their largest heights and angles",
+        "Where the chief ray and the rays on the rim of the beam of each field meet every surface: the largest height "
+        "and angles of incidence and refraction at each surface over all fields, wavelengths and rays, with the field "
+        "and the ray; --each, --json and -o also list every ray: point, direction cosines behind the surface and "
+        "angles, in the axes of each surface.",
+        """
+        double_gauss --plot angles.png
+        phone --field 0 20 37 --wavelength 0.4861 0.6563 -o rays.csv
+        spectrometer --rays chief --each""",
+        *LENS, CONDITIONS, plot("the largest angles by surface"), TABLE, "fields",
+        Option("rays", None, "NAME", "chief, upper and lower (on the rim of the beam along the direction of the "
+            "field), right and left (across it); default all", nargs="+", default=""),
+        switch("each", "list every ray in the text"),
     ),
     _command(
         "sag",

@@ -98,6 +98,8 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("max_bytes", memory, "BYTES", "memory limit, as 4GB: a computation that would need more is refused before "
            "it starts (default half of the free memory)"),
     # conditions
+    Option("magnification", finite, "M", "of the paraxial image, as -0.1: the object distance that gives it, and the "
+           "sensor there unless --sensor-distance is given"),
     Option("sensor_distance", finite, "MM", "from the last vertex before the image to the image"),
     Option("f_number", positive_finite, "N", "image-space F/#: focal length / entrance pupil diameter"),
     Option("entrance_pupil_diameter", positive_finite, "MM", "diameter of the entrance pupil",
@@ -185,7 +187,7 @@ def object_distance(several: str) -> Option:
 def conditions(several: str = "several: one result after the other") -> Adder:
     """Conditions other than those of the file."""
     surroundings = ("wavelengths", "ray_aiming", "temperature", "pressure", "mount")
-    distances = (object_distance(several), "sensor_distance")
+    distances = (exclusive(object_distance(several), "magnification"), "sensor_distance")
     return group("conditions other than the file's", *distances, APERTURE, *surroundings)
 
 

@@ -28,7 +28,7 @@ from raytrace.words import RaytraceError, did_you_mean, option
 
 #: Options that set the lens, by the keywords of `Lens.at`.
 CONDITIONS = (
-    *("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming"),
+    *("magnification", "sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming"),
     *("temperature", "pressure", "mount"),
 )
 #: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.

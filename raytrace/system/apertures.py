@@ -69,7 +69,8 @@ class Shape:
     edges: x, y (...) mm from its centre, and sizes -> its edges; reach: sizes -> range of |y| in the cross section;
     symmetry: "round", "mirror" (in x and y) or "none"; zemax: keywords of a .zmx file as aperture and obscuration;
     code: of tracing/cpp/apertures.h, None: clipped by torch alone; sizes: count of sizes, each at least 0, None: three
-    or more points x, y; is_hollow: sizes -> whether light may be blocked inside it.
+    or more points x, y; outlines: sizes -> closed lines x, y mm along its edges; is_hollow: sizes -> whether light may
+    be blocked inside it.
     """
 
     edges: Callable[[Tensor, Tensor, Sizes], list[Edge]]
@@ -78,6 +79,7 @@ class Shape:
     zemax: tuple[str, str]
     code: int | None = None
     sizes: int | None = 2
+    outlines: Callable[[Sizes], list[tuple[Tensor, Tensor]]] = lambda sizes: []
     is_hollow: Callable[[Sizes], bool] = lambda sizes: False
 
     def objection(self, sizes: Sizes) -> str:
@@ -133,14 +135,39 @@ def _ellipse(x: Tensor, y: Tensor, sizes: Sizes) -> list[Edge]:
     return [Edge((x / sizes[0]) ** 2 + (y / sizes[1]) ** 2, 1.0)]
 
 
+_AROUND = torch.linspace(0, 2 * torch.pi, 361, dtype=torch.float64)
+
+
+def _round_lines(sizes: Sizes) -> list[tuple[Tensor, Tensor]]:
+    return [(radius * torch.cos(_AROUND), radius * torch.sin(_AROUND)) for radius in sizes if radius > 0]
+
+
+def _oval_lines(sizes: Sizes) -> list[tuple[Tensor, Tensor]]:
+    return [(sizes[0] * torch.cos(_AROUND), sizes[1] * torch.sin(_AROUND))]
+
+
+def _box_lines(sizes: Sizes) -> list[tuple[Tensor, Tensor]]:
+    corners = torch.tensor([[1.0, -1, -1, 1, 1], [1, 1, -1, -1, 1]], dtype=torch.float64)
+    return [(sizes[0] * corners[0], sizes[1] * corners[1])]
+
+
+def _corner_lines(sizes: Sizes) -> list[tuple[Tensor, Tensor]]:
+    sides = [torch.tensor([float(size) for size in side], dtype=torch.float64) for side in _outlines(sizes)]
+    return [(side[::2], side[1::2]) for side in sides]
+
+
 SHAPES = {
     "circular": Shape(
-        _rings, lambda sizes: (sizes[0], sizes[1]), "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0
+        _rings, lambda sizes: (sizes[0], sizes[1]), "round", ("CLAP", "OBSC"), 0, outlines=_round_lines,
+        is_hollow=lambda sizes: sizes[0] > 0,
     ),
-    "rectangular": Shape(_box, lambda sizes: (0.0, sizes[1]), "mirror", ("SQAP", "SQOB"), 1),
-    "elliptic": Shape(_ellipse, lambda sizes: (0.0, sizes[1]), "mirror", ("ELAP", "ELOB"), 2),
-    "polygon": Shape(_polygons, _reach_of_corners, "none", ("USAP", "USOB"), 3, None, is_hollow=lambda sizes: True),
-}
+    "rectangular": Shape(_box, lambda sizes: (0.0, sizes[1]), "mirror", ("SQAP", "SQOB"), 1, outlines=_box_lines),
+    "elliptic": Shape(_ellipse, lambda sizes: (0.0, sizes[1]), "mirror", ("ELAP", "ELOB"), 2, outlines=_oval_lines),
+    "polygon": Shape(
+        _polygons, _reach_of_corners, "none", ("USAP", "USOB"), 3, None, outlines=_corner_lines,
+        is_hollow=lambda sizes: True,
+    ),
+}  # fmt: skip
 
 
 def edges(aperture: Aperture, hit: Tensor | Sequence[Tensor]) -> list[Edge]:
@@ -176,6 +203,12 @@ def clearances_of(aperture: Aperture, hit: Tensor) -> list[Tensor]:
 def reach(aperture: Aperture) -> tuple[Number, Number]:
     """The smallest and largest |y| of the shape from its centre, mm."""
     return SHAPES[aperture.shape].reach(aperture.extent)
+
+
+def outlines(aperture: Aperture) -> list[tuple[Tensor, Tensor]]:
+    """Closed lines x, y (N,) mm along the edges of an aperture, in the frame of its surface."""
+    lines = SHAPES[aperture.shape].outlines([torch.as_tensor(size, dtype=torch.float64) for size in aperture.extent])
+    return [(x + aperture.centre[0], y + aperture.centre[1]) for x, y in lines]
 
 
 def stands_inside(aperture: Aperture) -> bool:

@@ -219,6 +219,7 @@ def freed(lens: Whole, **conditions: object) -> Whole:
     """The lens without operands of the numbers that conditions of `Lens.at` set, which hold in every configuration."""
     paths: dict[str, tuple[Path, ...]] = {
         "object_distance": (("surfaces", 0, "thickness"),),
+        "magnification": (("surfaces", 0, "thickness"), ("surfaces", len(lens.surfaces) - 2, "thickness")),
         "sensor_distance": (("surfaces", len(lens.surfaces) - 2, "thickness"),),
         "f_number": (("aperture",),),
         "entrance_pupil_diameter": (("aperture",),),

@@ -448,6 +448,7 @@ class Lens:
         self,
         *,
         object_distance: Tensor | float | None = None,
+        magnification: Tensor | float | None = None,
         sensor_distance: Tensor | float | None = None,
         f_number: Tensor | float | None = None,
         entrance_pupil_diameter: Tensor | float | None = None,
@@ -465,7 +466,9 @@ class Lens:
         """The same lens under other conditions; a condition that is None stays.
 
         object_distance: mm from the object to surface 1, inf allowed; the sensor distance is unchanged: refocus by
-        `rt.focus`; sensor_distance: mm from the last surface before the image; f_number: image-space,
+        `rt.focus`; magnification: of the paraxial image, instead: the object where the image has it, by first-order
+        data at the primary wavelength, and the sensor in that image unless sensor_distance is given;
+        sensor_distance: mm from the last surface before the image; f_number: image-space,
         EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in weight and the first one primary
         unless wavelength_weights (W,) and primary_wavelength, its number from 1, are given; fields: y, or (x, y), in
         the lens's own kind, without vignetting factors, alike in weight unless field_weights (F,) are given; weights:
@@ -479,6 +482,10 @@ class Lens:
         Raises ValueError for conditions that no lens has.
         """
         from raytrace.tracing.geometry import contact_heights
+        from raytrace.tracing.paraxial import at_magnification
+
+        if magnification is not None and object_distance is not None:
+            raise ValueError("magnification and object_distance exclude each other: leave one out")
 
         lens = self if configuration is None else self.configuration(configuration)
         if mount is not None:
@@ -488,6 +495,7 @@ class Lens:
         lens = multiple.freed(
             lens,
             **dict(object_distance=object_distance, sensor_distance=sensor_distance, f_number=f_number),
+            **dict(magnification=magnification),
             **dict(entrance_pupil_diameter=entrance_pupil_diameter, wavelengths=wavelengths),
             **dict(wavelength_weights=wavelength_weights, primary_wavelength=primary_wavelength),
             **dict(fields=fields, field_weights=field_weights),
@@ -521,6 +529,8 @@ class Lens:
         if temperature is not None or pressure is not None:
             changes = temperature is not None and not _is_at(self, temperature)
             lens = with_environment(lens, temperature, pressure, expands=changes)
+        if magnification is not None:
+            lens = at_magnification(lens, magnification, keep_sensor=sensor_distance is not None)
         check(lens)
         return lens
 

@@ -105,12 +105,16 @@ class Arms:
         """
         nodes, weights = (self.inner.new_tensor(t)[:, None] for t in gauss_legendre(rings))
         inner, length, along = self.inner[..., None, :], (self.outer - self.inner)[..., None, :], 0.5 * (nodes + 1)
-        area = (self.share * (self.outer**2 - self.inner**2)).sum(-1)[..., None, None]
+        area = self.area()[..., None, None]
         is_whole = area > 1 - 64 * torch.finfo(area.dtype).eps
         radius = torch.where(is_whole, length * along.sqrt(), inner + length * along)
         step = length * torch.where(is_whole, 0.5 * length, radius)  # of r² from ring to ring, per weight
         points = self.origin[..., None, None] + radius * self.unit[..., None, :]
         return points.flatten(-2), (weights * step * self.share[..., None, :]).flatten(-2)
+
+    def area(self) -> Tensor:
+        """Area (D, F, W) of the clear pupils relative to the whole pupil, with derivatives."""
+        return (self.share * (self.outer**2 - self.inner**2)).sum(-1)
 
     def ends(self) -> tuple[Tensor, Tensor]:
         """Pupil points (2, D, F, W, 2 B) at both ends of every part, on the edge; and which parts there are."""
@@ -175,7 +179,7 @@ def is_clipped(scene: Scene, points: Tensor | None = None) -> bool:
 def clipped(scene: Scene, points: Tensor | None = None) -> Tensor:
     """Whether rays (D, F, W) of an object distance, or lens of a batch, fail; arguments as for `is_clipped`."""
     points = scene.wavelengths.new_zeros(2, 0) if points is None else points
-    if any(surface.apertures for surface in scene.lens.surfaces):
+    if scene.apertures:
         angle = torch.arange(_COARSE, dtype=points.dtype, device=points.device) * (2 * math.pi / _COARSE)
         points = torch.cat([points, _RIM * torch.stack([torch.cos(angle), torch.sin(angle)])], 1)
     if points.shape[1] == 0:
@@ -193,7 +197,7 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
     """
     like = scene.wavelengths
     around = 2 * math.pi if fold == "none" else math.pi
-    apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+    apertures = [aperture for each in scene.apertures.values() for aperture in each]
     if fold == "round":
         unit, origin = like.new_tensor([[0.0], [1.0]]).reshape(2, 1, 1, 1, 1), like.new_zeros(2, *scene.shape)
         unit = unit.expand(2, *scene.shape, 1)
@@ -224,7 +228,7 @@ def rule_near(
     no ray. Newton steps move its kinks and edges to those of each lens, by five rays an edge. The clear pupil of a lens
     that other apertures bound is searched as by `arms_of`.
     """
-    if not any(surface.apertures for surface in scene.lens.surfaces):
+    if not scene.apertures:
         return points, weights
     if arms is None:
         is_near, count = ~clipped(scene, points).flatten(1).any(-1), 4 * rings
@@ -439,7 +443,7 @@ def _enclosed(scene: Scene, unit: Tensor, origin: Tensor) -> tuple[Edges, int]:
     arms = unit.shape[-1]
     with torch.no_grad():
         reach = _reach(unit, origin)
-        apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+        apertures = [aperture for each in scene.apertures.values() for aperture in each]
         steps = _SCAN if any(map(stands_inside, apertures)) else _COARSER
         step = torch.linspace(0, 1, steps + 1, dtype=unit.dtype, device=unit.device)
         scanned = _clearances(scene, step[:, None, None, None, None] * reach, unit, origin)

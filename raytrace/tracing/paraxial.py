@@ -12,7 +12,15 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Number, quotient, select, value, value_of
 from raytrace.maths.result import Column, Result, Table, flat
-from raytrace.system.lens import Lens, aligned, is_round_about_axis, media, shared
+from raytrace.system.lens import (
+    Lens,
+    aligned,
+    is_round_about_axis,
+    media,
+    shared,
+    with_object_distance,
+    with_sensor_distance,
+)
 from raytrace.system.surface import Surface, power, signed, vertex_curvature, ynu
 
 #: A, B, C, D of y′ = A y + B ω, ω′ = C y + D ω.
@@ -417,6 +425,37 @@ def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Ten
     wavelength = lens.primary if wavelength is None else wavelength
     n = signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
     return gaussian(lens, n, wavelength).image_distance(n[0] / object_distance)
+
+
+def at_magnification(lens: Lens, magnification: Tensor | float, *, keep_sensor: bool) -> Lens:
+    """The lens with its object where the paraxial image has a magnification, and the sensor in that image.
+
+        d = n (1/m - D)/C,   A, B, C, D from surface 1 to behind the last surface before the image
+
+    keep_sensor: leave the sensor where it is. Raises ValueError for 0, an afocal lens, and where object or image are
+    virtual.
+    """
+    data = axial_beam(lens).data
+    m = torch.as_tensor(magnification, dtype=data.A.dtype, device=data.A.device)
+    if not bool(torch.isfinite(m).all()) or not bool((m != 0).all()):
+        raise ValueError(f"magnification {magnification}: expected a number other than 0, such as -0.1; "
+            "0 is an object at infinity, object_distance=inf")  # fmt: skip
+    if not bool((data.C != 0).all()):
+        raise ValueError("magnification: an afocal lens has the same one for every object; give object_distance")
+    distance = data.n_object * (1 / m - data.D) / data.C
+    image = data.image_distance(data.n_object / torch.where(distance == 0, torch.nan, distance))
+    side = torch.sign(data.n_image)
+    if not bool((distance > 0).all()) or not bool((side * image > 0).all()):
+        least, behind = (float(each.detach().min()) for each in (distance, side * image))
+        place = "behind surface 1" if least <= 0 else f"whose image, at {behind:.6g} mm, is virtual"
+        sign = "negative" if float(data.C.detach().min()) < 0 else "other"
+        raise ValueError(
+            f"magnification {float(m.detach().min()):g} needs an object at {least:.6g} mm, {place}; "
+            f"a real object and image have {sign} ones"
+        )
+    shape = () if lens.count is None else (-1,)
+    lens = with_object_distance(lens, distance.reshape(shape))
+    return lens if keep_sensor else with_sensor_distance(lens, image.reshape(shape))
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:

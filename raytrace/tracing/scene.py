@@ -280,6 +280,7 @@ class Scene:
     stored rays of earlier scenes, if any.
     largest: maximum of numbers () or (K,) over the whole scene that this one is a chunk of, by which decisions common
     to all its kernels are made. By default the scene is the whole.
+    last: number of the surface behind which rays end, 0 in front of surface 1; by default the image.
     """
 
     lens: Lens
@@ -287,11 +288,18 @@ class Scene:
     wavelengths: Tensor
     memo: Memo | None = None
     largest: Callable[[Tensor], Tensor] = lambda number: number
+    last: int | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(D, F, W)."""
         return len(self.lens.surfaces[0].thickness), self.fields.shape[-1], len(self.wavelengths)
+
+    @property
+    def apertures(self) -> dict[int, tuple[Aperture, ...]]:
+        """The apertures on the way of the rays, by surface."""
+        surfaces = self.lens.surfaces[1 : None if self.last is None else self.last + 1]
+        return {k: surface.apertures for k, surface in enumerate(surfaces, 1) if surface.apertures}
 
     def of(self, distances: slice | Tensor) -> "Scene":
         """The scene of some of the object distances or lenses."""
@@ -315,11 +323,13 @@ def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Ten
 def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
     """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P) on the sensor, vignetting factors applied.
 
-    Raises budget.OverBudget for more rays than fit in memory.
+    Of a scene whose rays end at a surface: those behind it, in its frame. Raises budget.OverBudget for more rays than
+    fit in memory.
     """
     (D, F, W), P = scene.shape, pupil.shape[-1]
     afford_rays(P, object_distances=D, fields=F, wavelengths=W)
-    rays = trace_bundle(_bundle(scene, pupil), scene.memo)
+    bundle = _bundle(scene, pupil)
+    rays = trace_bundle(bundle, scene.memo) if scene.last is None else _rays_behind(bundle, scene.last)
     batch = D, F, W, P
     return Rays(
         rays.position.expand(3, *batch),
@@ -329,20 +339,28 @@ def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
     )
 
 
+def _rays_behind(bundle: Bundle, last: int) -> Rays:
+    lens, _, wavelength, _ = bundle
+    indices = media(lens, wavelength)[: last + 1]
+    return trace_surfaces(sequence_of(lens)[:last], _launched(bundle), indices=indices, wavelength=wavelength)
+
+
 def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
     """Image points (2, D, F, W, P) on the sensor, crossings of every aperture, and which rays meet every surface.
 
-    No ray is vignetted. disc: pupil points (2, P), or (2, D, F, W, P) with axes of length 1 to broadcast.
+    No ray is vignetted. disc: pupil points (2, P), or (2, D, F, W, P) with axes of length 1 to broadcast. Of a scene
+    whose rays end at a surface: points on it, and surfaces up to it.
     """
-    if not any(surface.apertures for surface in scene.lens.surfaces):
+    apertures = scene.apertures
+    if not apertures:
         rays = trace_scene(scene, disc)
         return rays.position[:2], [], rays.valid
     shape = (*scene.shape, disc.shape[-1])
-    numbers = [k for k, surface in enumerate(scene.lens.surfaces) if k and surface.apertures]
-    hits, met = points_of_bundle(_bundle(scene, disc), (*numbers, len(scene.lens.surfaces) - 1), scene.memo)
+    last = len(scene.lens.surfaces) - 1 if scene.last is None else scene.last
+    hits, met = points_of_bundle(_bundle(scene, disc), (*apertures, last), scene.memo)
     *crossings, image = (hit.expand(2, *shape) for hit in hits)
-    pairs = zip(numbers, crossings, strict=True)
-    return image, [(a, hit) for k, hit in pairs for a in scene.lens.surfaces[k].apertures], met.expand(shape)
+    pairs = zip(apertures, crossings, strict=True)
+    return image, [(a, hit) for k, hit in pairs for a in apertures[k]], met.expand(shape)
 
 
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
