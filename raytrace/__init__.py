@@ -45,11 +45,16 @@ PUBLIC = {
     "scale": "edit.scaling",
     "reverse": "edit.turning",
     "insert": "edit.surfaces",
+    "insert_part": "edit.parts",
+    "replace_part": "edit.parts",
     "delete": "edit.surfaces",
     "join": "edit.surfaces",
     "split": "edit.surfaces",
     "bend": "edit.surfaces",
     "rename": "edit.surfaces",
+    # parts of vendors
+    "stock_find": "stock.index",
+    "stock_index": "stock.index",
     # media
     "AIR": "materials.glass",
     "MIRROR": "materials.glass",
@@ -211,6 +216,7 @@ ERRORS = {
     "BadSearch": "optimization.search_tasks",
     "BadSelection": "materials.selection",
     "BadSettings": "cli.settings",
+    "BadStock": "stock.index",
     "BadSubstitute": "io.source",
     "BadTolerance": "tolerancing.table",
     "BadVariables": "system.parameter_paths",
@@ -249,6 +255,7 @@ ERRORS = {
     "NoLight": "optimization.problem",
     "NoMelt": "materials.glass",
     "NoOptimum": "optimization.least_squares",
+    "NoPart": "stock.parts",
     "NoPictures": "imaging.pictures",
     "NoProblem": "optimization.problem",
     "NoSolid": "workshop.parts",
@@ -297,7 +304,7 @@ TOP = (
     *("ray_fan", "opd_fan", "distortion", "distortion_grid", "field_curvature", "lateral_colour", "incidence"),
     *("chromatic_focal_shift", "longitudinal_aberration", "encircled_energy", "relative_illumination"),
     *("rms_over_field", "sag", "thermal", "optimize", "search", "evaluate", "jacobian", "Merit", "tolerance"),
-    "tolerances",
+    *("tolerances", "stock_index", "stock_find"),
     *("Camera", "Variables", "Sensor", "render", "train", "RaytraceError", "RaytraceWarning"),
 )
 #: Packages whose public names are typed with them.
