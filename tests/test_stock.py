@@ -191,7 +191,11 @@ def test_files_of_vendors_have_their_listed_figures(tmp_path):
     """The focal lengths and diameters that the titles of the files state."""
     vendor = tmp_path / "vendor"
     vendor.mkdir()
-    for name in ("RayTracing__AC254-125-A-Zemax_ZMX_", "Kraken-Optical-Simulator__zmax_84383", "octave-wagenaarlab__AL108-A"):
+    for name in (
+        "RayTracing__AC254-125-A-Zemax_ZMX_",
+        "Kraken-Optical-Simulator__zmax_84383",
+        "octave-wagenaarlab__AL108-A",
+    ):
         shutil.copy(CORPUS / f"{name}.zmx", vendor)
     shutil.copy(CORPUS / "optiland__thorlabs_lj1598l1.zmx", vendor)
     rt.stock_index(vendor, tmp_path / "stock.sqlite")

@@ -201,14 +201,15 @@ def designs() -> dict[str, tuple[rt.Lens, dict]]:
     )  # fmt: skip
     free = {"vary": "curvature thickness", "merit": "spot"}
     return {
-        "triplet": (triplet, free | {"hold": "efl=50 glass_thickness>=1.5 air_thickness>=0.3 total_track<=75"}),
+        "triplet": (triplet, free | {
+            "vary": "curvature thickness:2,4,5,7", "hold": "efl=50 air_thickness>=0.5 total_track<=80",
+        }),
         "relay": (relay, free | {
-            "vary": "curvature thickness thickness:0",
-            "hold": "magnification=-1 air_thickness>=0.5 glass_thickness>=2",
+            "vary": "curvature thickness:0,3,4,7", "hold": "magnification=-1 air_thickness>=0.5",
         }),
         "expander": (expander, free | {
-            "vary": "curvature thickness:1-4", "merit": "angular",
-            "hold": "angular_magnification=0.2 glass_thickness>=2 air_thickness>=0.5",
+            "vary": "curvature thickness:2", "merit": "angular", "hold": "angular_magnification=0.2",
+            "bounds": "thickness_2:60..110",
         }),
     }  # fmt: skip
 
@@ -226,9 +227,11 @@ def main(folder: str) -> None:
     for name, (lens, how) in designs().items():
         designed = rt.optimize(lens, **how)
         rt.write_lens(designed.lens, target / f"{name}.zmx")
+        started = time.process_time()
         fitted = rt.optimize(designed.lens, stock=target / "stock.sqlite", **how)
+        seconds = time.process_time() - started
         rt.write_lens(fitted.lens, target / f"{name}_stock.zmx")
-        print(f"{name}: merit {designed.merit_after:.6g} → {fitted.merit_after:.6g}, {fitted.seconds:.1f} s")
+        print(f"{name}: merit {designed.merit_after:.6g} → {fitted.merit_after:.6g}, {seconds:.1f} s")
         print(fitted, flush=True)
 
 

@@ -6,7 +6,7 @@ which parts of stock replace (`stock_fit`).
 1. Of every item that is left, an expansion of the merit in the variables predicts the merit with each candidate when
    all other variables have followed (`glass_choice.expansion`).
 2. One item takes its turn. The best few candidates are optimised over some cycles, and the merit reached decides. The
-   rest of the lens is then optimised with it.
+   rest of the lens is then optimised with it. Not one but the best few designs are continued so.
 3. When all items are fitted, one is exchanged at a time, until no exchange lowers the merit.
 
 The sequence is run twice, and the better end is kept: each time the item comes first whose best candidate raises the
@@ -31,19 +31,20 @@ from raytrace.optimization.least_squares import SumOfSquares, least_squares
 from raytrace.optimization.problem import Problem, typical_of
 from raytrace.words import RaytraceWarning, calling_level
 
-#: Candidates of an item that are optimised, and over how many cycles.
-TRIED, TRIAL_CYCLES = 4, 15
+#: Candidates of an item that are optimised, and over how many cycles; designs that are continued.
+TRIED, TRIAL_CYCLES, BEAM = 4, 15, 3
 _CYCLES = 100  # with every item
 _ROUNDS = 3  # of exchanges through all items
 _GAIN = 1e-4  # smallest relative reduction of the merit by an exchange
 _MET = 1e-5  # violation up to which a condition counts as met
+_NEARLY = 1e-2  # violation of a condition that doubles the merit of a trial, whose cycles are few
 
 #: The two orders of the items.
 ORDERS = {"worst": "the item that raises the merit most first", "best": "the item that raises the merit least first"}
 
 
 class NotFitted(RaytraceWarning):
-    """A radius without a test plate, or an element without a part."""
+    """A radius without a test plate, an element without a part, or a part that is smaller than the light."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +82,17 @@ class Design:
         """Fewer failed rays, then conditions met, then a lower merit."""
         return self.state.lost, self.missed if self.missed > _MET else 0.0, self.merit
 
+    def score(self) -> tuple[float, float]:
+        """The rank of a trial: fewer failed rays, then a lower merit with a charge for conditions that are not met."""
+        return self.state.lost, self.merit * (1 + self.missed / _NEARLY)
+
 
 @dataclass(frozen=True)
 class FitStep:
     """One step of a fit.
 
-    kind: "design", the lens before it, "fitted", "exchanged" or "order", the other sequence of items, whose end is not
-    better; surfaces, name: of the item and its candidate; predicted, reached: merits. tried: (name, predicted, reached)
-    of all candidates that were optimised.
+    kind: "design", the lens before it, "fitted" or "exchanged"; surfaces, name: of the item and its candidate;
+    predicted, reached: merits.
     """
 
     kind: str
@@ -97,7 +101,6 @@ class FitStep:
     surfaces: str = ""
     name: str = ""
     predicted: float = float("nan")
-    tried: tuple[tuple[str, float, float], ...] = ()
 
 
 @value
@@ -105,8 +108,8 @@ class Fitted:
     """The report of a fit.
 
     what: "parts" or "test plates"; source: the file of the list; order: a key of ORDERS; steps: of the sequence that is
-    kept, its exchanges included; entries: a row for each item, (heading, unit) -> cells; missing: (surfaces, reason) of
-    the items without a candidate; evaluations: of the merit function.
+    kept, its exchanges included; entries: a row for each item, (heading, unit) -> cells; notes: (surfaces, text) of the
+    items without a candidate, and of those that the light exceeds; evaluations: of the merit function.
     """
 
     what: str
@@ -114,7 +117,7 @@ class Fitted:
     order: str
     steps: tuple[FitStep, ...]
     entries: Columns
-    missing: tuple[tuple[str, str], ...]
+    notes: tuple[tuple[str, str], ...]
     evaluations: int
 
     @property
@@ -134,8 +137,9 @@ class Fitted:
             Column("cost", form=".3g"): ["", *cost],
             Column("seconds", form=".1f", heading="s"): [step.seconds for step in self.steps],
         }
-        notes = [f"surfaces {surfaces}: {reason}" for surfaces, reason in self.missing]
-        entries = [Table(self.entries, [""], ["", *notes] if notes else [])] if self.entries or notes else []
+        notes = [f"surfaces {surfaces}: {text}" for surfaces, text in self.notes]
+        is_fitted = len(self.steps) > 1
+        entries = [Table(self.entries if is_fitted else {}, [""], ["", *notes] if notes and is_fitted else notes)]
         return [Table(columns, ["", *head, f"  order: {ORDERS[self.order]}", ""]), *entries]
 
     def document(self) -> dict[str, Any]:
@@ -150,14 +154,14 @@ class Fitted:
             "merit": end,
             "items": [dict(zip(names, row, strict=True)) for row in rows],
             "steps": [dataclasses.asdict(step) for step in self.steps],
-            "missing": [{"surfaces": surfaces, "reason": reason} for surfaces, reason in self.missing],
+            "notes": [{"surfaces": surfaces, "text": text} for surfaces, text in self.notes],
         }
 
     def warn(self) -> None:
-        """One warning of the items without a candidate."""
-        if self.missing:
-            words = "; ".join(f"surfaces {surfaces}: {reason}" for surfaces, reason in self.missing)
-            warnings.warn(f"without {self.what}: {words}", NotFitted, stacklevel=calling_level())
+        """One warning of all notes."""
+        if self.notes:
+            words = "; ".join(f"surfaces {surfaces}: {text}" for surfaces, text in self.notes)
+            warnings.warn(f"{self.what}: {words}", NotFitted, stacklevel=calling_level())
 
 
 class Fit(ABC):
@@ -182,6 +186,7 @@ class Fit(ABC):
         self.order, self.interrupted = next(iter(ORDERS)), False
         self.missing: list[tuple[str, str]] = []
         self.steps: list[FitStep] = [FitStep("design", design.merit, 0.0)]
+        self.so_far: tuple[Design, list[FitStep]] = (design, [])
 
     # -- of a kind of items -------------------------------------------------------------------------------------------
 
@@ -205,6 +210,10 @@ class Fit(ABC):
     def entries(self, design: Design) -> Columns:
         """The table of the fitted items."""
 
+    def exceeded(self, design: Design) -> list[tuple[str, str]]:
+        """Notes of the items that the light exceeds at the end."""
+        return []
+
     def fixed(self, design: Design) -> set[tuple[int, str]]:
         """Addresses of the variables of the design that its candidates fix."""
         return set()
@@ -213,28 +222,23 @@ class Fit(ABC):
 
     def run(self) -> Design:
         """The best design, with all items fitted, or after Ctrl-C those that are."""
-        best, current, kept = self.design, self.design, self.steps
+        best, kept = self.design, self.steps
         items = self.items()
         try:
-            for order in ORDERS:
+            for order in ORDERS if len(items) > 1 else [*ORDERS][:1]:
                 if best.chosen and time.monotonic() > self.until:
                     break
-                self.steps, current = kept[:1], self.design
-                for current in self.sequence(self.design, items, order):  # noqa: B007
-                    if not best.chosen:
-                        kept = self.steps
-                current = self.descend(current, self.cycles)
-                if not best.chosen or current.rank() < best.rank():
-                    best, kept, self.order = current, self.steps, order
-                if len(items) < 2:
-                    break
+                design, steps = self.sequence(items, order)
+                if not best.chosen or design.rank() < best.rank():
+                    best, kept, self.order = design, [*self.steps[:1], *steps], order
             self.steps = kept
             best = self.exchanged(best)
         except KeyboardInterrupt:
-            self.interrupted = True
-            best = best if best.chosen else current
-            unfitted = [(item.words, "interrupted before it was fitted") for item in items if item not in best.chosen]
-            self.missing += unfitted
+            self.interrupted, self.steps = True, kept if best.chosen else [*self.steps[:1], *self.so_far[1]]
+            best = best if best.chosen else self.so_far[0]
+            self.missing += [
+                (item.words, "interrupted before it was fitted") for item in items if item not in best.chosen
+            ]
         self.steps = [*self.steps[:-1], dataclasses.replace(self.steps[-1], reached=best.merit)]
         return best
 
@@ -245,24 +249,45 @@ class Fit(ABC):
             order=self.order,
             steps=tuple(self.steps),
             entries=self.entries(design),
-            missing=tuple(self.missing),
+            notes=(*self.missing, *self.exceeded(design)),
             evaluations=self.evaluations,
         )
 
-    def sequence(self, design: Design, items: Sequence[Item], order: str) -> Any:
-        """The designs with one item more each, in an order."""
+    def sequence(self, items: Sequence[Item], order: str) -> tuple[Design, list[FitStep]]:
+        """The best design with all items fitted, one after the other in an order, and its steps.
+
+        The best few designs with some of the items are continued (a beam search), as the candidate that is best for
+        one item may leave no good one for the next.
+        """
         waiting = [*items]
+        beam: list[tuple[Design, list[FitStep]]] = [(self.design, [])]
         while waiting:
-            each = {item: self.candidates(design, item) for item in waiting}
+            each = {item: self.candidates(beam[0][0], item) for item in waiting}
             pick: Callable = max if order == "worst" else min
             item = pick(waiting, key=lambda item: each[item][0][0])
             waiting.remove(item)
-            trial = self.tried(design, item, each[item])
-            assert trial is not None, "an item has a candidate"
-            design, step = trial
-            design = self.descend(design, self.cycles) if waiting else design
-            self.steps.append(dataclasses.replace(step, reached=design.merit, seconds=self.seconds))
-            yield design
+            trials = [
+                (predicted, k, candidate)
+                for k, (design, _) in enumerate(beam)
+                for predicted, candidate in (self.candidates(design, item) if k else each[item])[:TRIED]
+            ]
+            trials.sort(key=lambda trial: trial[0])
+            ends = []
+            for predicted, k, candidate in trials[: TRIED + len(beam)]:
+                if ends and time.monotonic() > self.until:
+                    break
+                end = self.trial(beam[k][0], item, candidate)
+                step = FitStep("fitted", end.merit, self.seconds, item.words, self.name(item, candidate), predicted)
+                ends.append((end, [*beam[k][1], step]))
+            ends.sort(key=lambda pair: pair[0].score())
+            beam = [(self.descend(end, self.cycles), steps) for end, steps in ends[:BEAM]]
+            beam = [
+                (end, [*steps[:-1], dataclasses.replace(steps[-1], reached=end.merit, seconds=self.seconds)])
+                for end, steps in beam
+            ]
+            beam.sort(key=lambda pair: pair[0].score())
+            self.so_far = beam[0]
+        return min(beam, key=lambda pair: pair[0].rank())
 
     def exchanged(self, design: Design) -> Design:
         """The design after exchanges of one item at a time, until none lowers the merit."""
@@ -271,41 +296,28 @@ class Fit(ABC):
             if not left or time.monotonic() > self.until:
                 break
             item = left.pop(0)
-            others = [
-                (predicted, candidate)
-                for predicted, candidate in self.candidates(design, item)
-                if candidate != design.chosen[item]
-            ]
-            trial = self.tried(design, item, others)
-            if trial is None:
+            ends = []
+            for predicted, candidate in self.candidates(design, item)[: TRIED + 1]:
+                if candidate != design.chosen[item]:
+                    ends.append((self.trial(design, item, candidate), predicted, candidate))
+            if not ends:
                 continue
+            trial, predicted, candidate = min(ends, key=lambda end: end[0].score())
             lost, missed, merit = design.rank()
-            end = self.descend(trial[0], self.cycles) if trial[0].rank() < (lost, missed, 1.2 * merit) else trial[0]
+            end = self.descend(trial, self.cycles) if trial.score() < (lost, 1.5 * design.score()[1]) else trial
             if end.rank() < (lost, missed, merit * (1 - _GAIN)):
-                design = end
-                left = [other for other in design.chosen if other != item]
-                step = dataclasses.replace(trial[1], kind="exchanged", reached=end.merit, seconds=self.seconds)
-                self.steps.append(step)
+                design, left = end, [other for other in design.chosen if other != item]
+                words = item.words, self.name(item, candidate)
+                self.steps.append(FitStep("exchanged", end.merit, self.seconds, *words, predicted))
         return design
 
-    def tried(
-        self, design: Design, item: Item, candidates: Sequence[tuple[float, Any]]
-    ) -> tuple[Design, FitStep] | None:
-        """The best of the promising candidates, optimised over some cycles; None where there is none."""
-        best: tuple[Design, FitStep] | None = None
-        tried: list[tuple[str, float, float]] = []
-        for predicted, candidate in candidates[:TRIED]:
-            if best is not None and time.monotonic() > self.until:
-                break
-            end = self.descend(self.placed(design, item, candidate), min(TRIAL_CYCLES, self.cycles))
-            name = self.name(item, candidate)
-            tried.append((name, predicted, end.merit))
-            if self.bar is not None:
-                self.bar.update(1)
-                self.bar.set_postfix_str(f"surfaces {item.words}: {name}, merit {end.merit:.6g}")
-            if best is None or end.rank() < best[0].rank():
-                best = end, FitStep("fitted", end.merit, self.seconds, item.words, name, predicted)
-        return None if best is None else (best[0], dataclasses.replace(best[1], tried=tuple(tried)))
+    def trial(self, design: Design, item: Item, candidate: Any) -> Design:
+        """The design with a candidate, optimised over some cycles."""
+        end = self.descend(self.placed(design, item, candidate), min(TRIAL_CYCLES, self.cycles))
+        if self.bar is not None:
+            self.bar.update(1)
+            self.bar.set_postfix_str(f"surfaces {item.words}: {self.name(item, candidate)}, merit {end.merit:.6g}")
+        return end
 
     def descend(self, design: Design, cycles: int) -> Design:
         """The design at its minimum."""

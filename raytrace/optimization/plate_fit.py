@@ -110,12 +110,15 @@ class PlateFit(Fit):
         return set.union(*(shapes_of(self.lens, k, sign * factor) for k, factor in self.factors[item].items()))
 
     def _radii(self, item: Item) -> list[Radius]:
-        """The curvatures that plates of the shapes and the diameter test, in either direction."""
+        """The curvatures within the bounds that plates of the shapes and the diameter test, in either direction."""
         size, result = 2 * max(self.heights[k] for k in self.factors[item]), []
         wanted = {sign: self._shapes(item, sign) for sign in (1.0, -1.0)}
+        low, high = (float(ends[self.column[item]]) for ends in (self.design.lower, self.design.upper))
         for radius, plates in self.by_radius.items():
             large = [plate for plate in plates if plate.diameter >= size * (1 - 1e-9)]
             for sign in (1.0, -1.0) if math.isfinite(radius) else (1.0,):
+                if not low <= sign / radius <= high:
+                    continue
                 needed = wanted[sign] if math.isfinite(radius) else set()
                 used = [plate for plate in large if needed & {*plate.shapes} or not needed]
                 if used and needed <= {shape for plate in used for shape in plate.shapes}:
@@ -168,6 +171,8 @@ class PlateFit(Fit):
             ],
             Column("plate", form="<"): [" ".join(filter(None, (p.name for p in used))) or "-" for used in plates],
             Column("tolerance", form="<"): [next((p.tolerance for p in used if p.tolerance), "-") for used in plates],
-            Column("plate diameter", "mm", ".4g"): [min(p.diameter for p in used) for used in plates],
+            Column("plate diameter", "mm", ".4g"): [
+                size if math.isfinite(size := max(p.diameter for p in used)) else "-" for used in plates
+            ],
             Column("clear diameter", "mm", ".4g"): [2 * heights[k] for *_, k in rows],
         }

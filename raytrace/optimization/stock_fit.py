@@ -8,7 +8,6 @@ from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
-import torch
 
 from raytrace.edit.parts import faces_of, left_of, no_group, turned_part, with_part
 from raytrace.materials.glass import abbe_number, nd
@@ -24,12 +23,12 @@ from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import GLASS
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import clear_semi_diameters
+from raytrace.tracing.geometry import light_diameter
 from raytrace.words import RaytraceError, option
 
 _NEAR = 3.0  # largest factor between the powers of an element and of its part
 #: Parts, in one orientation, that an expansion by the numbers of the element selects, and the nearest in power.
-_SELECTED, _NEAREST = 12, 6
+_SELECTED, _NEAREST = 8, 4
 _TIGHT = 1e-3  # relative part by which the light may exceed a part
 
 
@@ -86,9 +85,7 @@ class StockFit(Fit):
                 continue
             faces = self._faces(lens, item)
             efl = float(data_of(faces, lens.primary).effective_focal_length)
-            sizes = [clear_semi_diameters(view, range(first, last + 1)) for view in lens.configurations]
-            clear = 2 * max(float(size) for each in sizes for size in each.values())
-            self.of_element[item] = efl, clear
+            self.of_element[item] = efl, light_diameter(lens, range(first, last + 1))
             if not self._possible(item):
                 self.missing.append((item.words, self._none(item)))
             elif not self._outside(item):
@@ -224,6 +221,22 @@ class StockFit(Fit):
         state: SumOfSquares = problem.state(x, True)
         return Design(problem, lower, upper, state, {**design.chosen, item: candidate})
 
+    def exceeded(self, design: Design) -> list[tuple[str, str]]:
+        lens, notes = design.problem.model.lens_at(design.state.x), []
+        for item, candidate in design.chosen.items():
+            light, clear = (
+                light_diameter(lens, range(item.surfaces[0], item.surfaces[-1] + 1)),
+                candidate.part.figures.clear,
+            )
+            if light > clear * (1 + _TIGHT):
+                notes.append(
+                    (
+                        item.words,
+                        f"light of {light:.4g} mm, but {candidate.part.figures.part} is clear to {clear:.4g} mm",
+                    )
+                )
+        return notes
+
     # -- report -------------------------------------------------------------------------------------------------------
 
     def name(self, item: Item, candidate: Oriented) -> str:
@@ -232,11 +245,7 @@ class StockFit(Fit):
     def entries(self, design: Design) -> Columns:
         rows = sorted(design.chosen.items(), key=lambda pair: pair[0].surfaces)
         lens = design.problem.model.lens_at(design.state.x)
-        light = []
-        for item, _ in rows:
-            with torch.no_grad():
-                each = clear_semi_diameters(lens, range(item.surfaces[0], item.surfaces[-1] + 1))
-            light.append(2 * max(float(size) for size in each.values()))
+        light = [light_diameter(lens, range(item.surfaces[0], item.surfaces[-1] + 1)) for item, _ in rows]
         figures = [candidate.part.figures for _, candidate in rows]
         return {
             Column("surfaces", form="<"): [item.words for item, _ in rows],
