@@ -7,10 +7,10 @@ and biconcave lenses of N-BK7, negative ones of N-SF11 too, and achromats of two
 FOLDER/stock.sqlite; and the three designs, FOLDER/triplet.zmx, relay.zmx and expander.zmx, and fits them.
 """
 
+import argparse
 import csv
 import functools
 import math
-import sys
 import time
 import warnings
 from pathlib import Path
@@ -214,26 +214,30 @@ def designs() -> dict[str, tuple[rt.Lens, dict]]:
     }  # fmt: skip
 
 
-def main(folder: str) -> None:
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, help="folder of the parts, their index and the lenses")
+
+
+def main(folder: Path) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    target = Path(folder)
-    target.mkdir(exist_ok=True)
-    started = time.monotonic()
-    print(f"{table(target / 'parts.csv')} parts, {time.monotonic() - started:.0f} s")
-    started = time.monotonic()
-    print(rt.stock_index(target / "parts.csv", target / "stock.sqlite"))
-    print(f"index: {time.monotonic() - started:.1f} s")
+    folder.mkdir(exist_ok=True)
+    print(f"{table(folder / 'parts.csv')} parts")
+    started = time.process_time()
+    print(rt.stock_index(folder / "parts.csv", folder / "stock.sqlite"))
+    print(f"index: {time.process_time() - started:.1f} s of processor time")
     for name, (lens, how) in designs().items():
         designed = rt.optimize(lens, **how)
-        rt.write_lens(designed.lens, target / f"{name}.zmx")
+        rt.write_lens(designed.lens, folder / f"{name}.zmx")
         started = time.process_time()
-        fitted = rt.optimize(designed.lens, stock=target / "stock.sqlite", **how)
+        fitted = rt.optimize(designed.lens, stock=folder / "stock.sqlite", **how)
         seconds = time.process_time() - started
-        rt.write_lens(fitted.lens, target / f"{name}_stock.zmx")
-        print(f"{name}: merit {designed.merit_after:.6g} → {fitted.merit_after:.6g}, {seconds:.1f} s")
+        rt.write_lens(fitted.lens, folder / f"{name}_stock.zmx")
+        print(f"{name}: merit {designed.merit_after:.6g} → {fitted.merit_after:.6g}, {seconds:.1f} s of processor time")
         print(fitted, flush=True)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(arguments)
+    main(**vars(arguments.parse_args()))
