@@ -44,7 +44,7 @@ def two_singlets() -> rt.Lens:
 
 
 SINGLETS = {
-    "merit": MERIT, "vary": "curvature thickness:2 sensor", "hold": "magnification=-1", "bounds": "thickness_2:5..30",
+    "merit": MERIT, "vary": "curvature thickness:2 sensor", "hold": "magnification=-1", "bounds": "thickness_2:2..60",
 }  # fmt: skip
 
 
@@ -123,12 +123,15 @@ def test_the_shape_of_the_glass_and_the_diameter_are_respected(designed):
         *(TestPlate(45.0, (shape,)) for shape in ("convex", "concave")),
         TestPlate(43.0, ("convex",)),
         TestPlate(140.0, ("convex",)),
+        TestPlate(139.0, ("concave",)),
     ]
     fitted = rt.optimize(designed, **DOUBLET, test_plates=plates)
-    assert [float(fitted.lens.surfaces[k].radius) for k in (1, 2, 3)] == pytest.approx([66, -45, -140])
+    radii = [abs(float(fitted.lens.surfaces[k].radius)) for k in (1, 2, 3)]
+    assert radii[1] == pytest.approx(45)
+    assert {round(radii[0]), round(radii[2])} <= {66, 140}
     entries = {column.name: cells for column, cells in fitted.fitted.entries.items()}
-    assert entries["plate"][0] == "A"
-    assert entries["tolerance"][0] == "0.1 %"
+    assert entries["plate"] == ["A" if round(radius) == 66 else "-" for radius in radii]
+    assert entries["tolerance"] == ["0.1 %" if round(radius) == 66 else "-" for radius in radii]
     assert entries["shape"] == ["convex", "concave convex", "convex"]
     with pytest.warns(rt.NotFitted, match="no plate for a concave and convex"):
         rest = rt.optimize(designed, **DOUBLET, test_plates=[TestPlate(61.5, ("convex",)), TestPlate(140, ("convex",))])

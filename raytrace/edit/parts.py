@@ -134,10 +134,10 @@ def with_part(
         if may_change and bool((gap + shift).isfinite()):
             surfaces[k] = dataclasses.replace(surfaces[k], thickness=(gap + shift).clamp(min=min(0.0, float(gap))))
     for k, face in enumerate(faces, first):
-        own: dict[str, Any] = {"comment": name if k == first else ""}
+        kept: dict[str, Any] = {"comment": name if k == first else ""}
         if k == last:
-            own |= {field: getattr(surfaces[k], field) for field in (*GAP, "expansion")}
-        surfaces[k] = dataclasses.replace(face, **own)
+            kept |= {field: getattr(surfaces[k], field) for field in (*GAP, "expansion")}
+        surfaces[k] = dataclasses.replace(face, **kept)
     lost: list[str] = []
     lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
     if (data := lens.optimization_data) is not None:

@@ -37,7 +37,7 @@ _CYCLES = 100  # with every item
 _ROUNDS = 3  # of exchanges through all items
 _GAIN = 1e-4  # smallest relative reduction of the merit by an exchange
 _MET = 1e-5  # violation up to which a condition counts as met
-_NEARLY = 1e-2  # violation of a condition that doubles the merit of a trial, whose cycles are few
+_NEARLY = 1e-3  # violation of a condition that doubles the merit of a trial, whose cycles are few
 
 #: The two orders of the items.
 ORDERS = {"worst": "the item that raises the merit most first", "best": "the item that raises the merit least first"}
@@ -285,9 +285,9 @@ class Fit(ABC):
                 (end, [*steps[:-1], dataclasses.replace(steps[-1], reached=end.merit, seconds=self.seconds)])
                 for end, steps in beam
             ]
-            beam.sort(key=lambda pair: pair[0].score())
+            beam.sort(key=lambda pair: pair[0].rank())
             self.so_far = beam[0]
-        return min(beam, key=lambda pair: pair[0].rank())
+        return beam[0]
 
     def exchanged(self, design: Design) -> Design:
         """The design after exchanges of one item at a time, until none lowers the merit."""

@@ -169,21 +169,21 @@ class StockFit(Fit):
         single = len(lens.wavelengths) == 1
         names = [*((k, "curvature") for k in range(first, last + 1)), *((k, "thickness") for k in range(first, last))]
         names += [(k, name) for k in range(first, last) for name in [*GLASS][: 1 if single else 2]]
-        own = tuple(Vary(k, name) for k, name in names)
+        numbers = tuple(Vary(k, name) for k, name in names)
         variables, solves = left_of(design.problem.model.variables, design.problem.model.solves, first, last)
         bounds = {
             v.name: pair for v, *pair in zip(design.problem.model.variables, design.lower, design.upper, strict=True)
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", VariedGlass)
-            model = DesignVariables(with_modelled(lens, own), (*variables, *own), solves)
+            model = DesignVariables(with_modelled(lens, numbers), (*variables, *numbers), solves)
         problem = design.problem.of(model)
         state = problem.state(model.start, True)
         inside = [k for k, v in enumerate(variables) if bounds[v.name][0] < model.start[k] < bounds[v.name][1]]
         columns = np.arange(len(variables), len(model.variables))
         quadratic = relaxed(state, np.array(inside, dtype=int), columns)
-        numbers = np.array([self._numbers(self.oriented(candidate), single) for candidate in every])
-        return quadratic.merit(numbers - model.start[columns])
+        values = np.array([self._numbers(self.oriented(candidate), single) for candidate in every])
+        return quadratic.merit(values - model.start[columns])
 
     @staticmethod
     def _numbers(faces: tuple[Surface, ...], single: bool) -> list[float]:

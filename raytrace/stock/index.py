@@ -33,7 +33,7 @@ from raytrace.system import prescription
 from raytrace.system.lens import Lens
 from raytrace.words import RaytraceError, did_you_mean, option
 
-#: The index that commands read where none is named.
+#: The index that commands read where none is given.
 DEFAULT = "stock.sqlite"
 #: Suffixes of indices, and of lens files of vendors; tables of prescriptions are not among them.
 INDICES = (".sqlite", ".db")
@@ -133,17 +133,17 @@ def stock_index(
     check_output(output, INDICES)
     source = Path(folder)
     if source.suffix.lower() == ".csv":
-        named = _of_table(source)
+        readers = _of_table(source)
     elif source.is_dir():
         paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in READ and path.is_file())
-        named = [(str(path.relative_to(source)), functools.partial(_of_file, path, catalogs)) for path in paths]
+        readers = [(str(path.relative_to(source)), functools.partial(_of_file, path, catalogs)) for path in paths]
     else:
         raise BadStock(f"{folder}: no such folder; expected a folder of lens files, or a table of parts (.csv)")
     parts: dict[str, Figures] = {}
     unread: list[tuple[str, str]] = []
     with closing(_empty()) as database:
-        bar = progress(len(named), "file") if progress else None
-        for file, read in named:
+        bar = progress(len(readers), "file") if progress else None
+        for file, read in readers:
             try:
                 figures, content, glass_catalogs = read()
                 if figures.part in parts:
@@ -158,7 +158,7 @@ def stock_index(
             bar.close()
         if not parts:
             reason = f"; {unread[0][0]}: {unread[0][1]}" if unread else f"; expected files {', '.join(READ)}"
-            raise BadStock(f"{folder}: no part in {len(named)} files{reason}")
+            raise BadStock(f"{folder}: no part in {len(readers)} files{reason}")
         database.executemany("INSERT INTO unread VALUES (?, ?)", unread)
         database.commit()
         content = database.serialize()
@@ -447,8 +447,8 @@ def _range(name: str, wanted: Range, tolerance: float) -> tuple[float, float, fl
 def part_named(index: str | os.PathLike, name: str) -> StockPart:
     """The part of an index by its number, in any case. Raises NoPart."""
     every = parts_of(index)
-    found = next((part for part in every if part.figures.part.lower() == name.lower()), None)
-    if found is None:
+    part = next((part for part in every if part.figures.part.lower() == name.lower()), None)
+    if part is None:
         meant = did_you_mean(name, [part.figures.part for part in every])
         raise NoPart(f"{index}: no part {name!r} among {len(every)}{meant}; `raytrace stock find` lists them")
-    return found
+    return part

@@ -174,8 +174,8 @@ def _number(lens: Lens, file: str) -> str:
 
 
 def _vendor(text: str) -> str:
-    found = (name for name, pattern in _VENDORS.items() if re.search(pattern, text, re.IGNORECASE | re.MULTILINE))
-    return next(found, "")
+    vendors = (name for name, pattern in _VENDORS.items() if re.search(pattern, text, re.IGNORECASE | re.MULTILINE))
+    return next(vendors, "")
 
 
 def _outer(titles: str, text: str, clear: float) -> float:
