@@ -102,6 +102,7 @@ from raytrace.optimization.checkpoint import BadCheckpoint as BadCheckpoint
 from raytrace.optimization.conditions import ReplacedCondition as ReplacedCondition
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
+from raytrace.optimization.fitting import NotFitted as NotFitted
 from raytrace.optimization.least_squares import NoOptimum as NoOptimum
 from raytrace.optimization.least_squares import NoStep as NoStep
 from raytrace.optimization.merit import BadMerit as BadMerit
@@ -123,6 +124,11 @@ from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.shards import FailedElsewhere as FailedElsewhere
 from raytrace.shards import ProcessLost as ProcessLost
+from raytrace.stock.index import BadStock as BadStock
+from raytrace.stock.index import stock_find as stock_find
+from raytrace.stock.index import stock_index as stock_index
+from raytrace.stock.parts import NoPart as NoPart
+from raytrace.stock.plates import BadPlates as BadPlates
 from raytrace.stores import DamagedLine as DamagedLine
 from raytrace.stores import Unfit as Unfit
 from raytrace.system.lens import Lens as Lens

@@ -27,8 +27,9 @@ FLOORS = {
     "io": 4,
     # computations
     "tracing": 5,
-    "edit": 6,
+    "stock": 6,
     "psf_models": 6,
+    "edit": 7,
     "analysis": 7,
     "wave_optics": 7,
     "optimization": 8,

@@ -35,7 +35,7 @@ class Tool:
 
     @property
     def command(self) -> Command:
-        """The row of the command; of a subcommand as `wave-psf`."""
+        """The row of the command; of a subcommand as `stock_find`."""
         commands = [*COMMANDS, *(child for command in COMMANDS for child in command.subcommands)]
         return next(command for command in commands if command.verb == self.name)
 
@@ -109,7 +109,7 @@ class Tool:
 
     def arguments(self, values: Mapping[str, object]) -> argparse.Namespace:
         """The parsed command line of parameters by name. Raises BadParameter."""
-        arguments = {action.dest: action.default for action in self.parser._actions}
+        arguments = {action.dest: _default(action) for action in self.parser._actions}
         names = (*self.actions, "overwrite") if self.writes else (*self.actions,)
         given = {self._known(name, names, values): value for name, value in values.items() if value is not None}
         for name, value in given.items():
@@ -159,6 +159,8 @@ TOOLS = {
         Tool("convert"),
         Tool("glass"),
         Tool("glasses"),
+        Tool("stock_index"),
+        Tool("stock_find"),
     )
 }
 
@@ -213,6 +215,12 @@ def _is_list(action: argparse.Action) -> bool:
 
 def _is_required(action: argparse.Action) -> bool:
     return action.required and action.nargs not in ("*", "?")
+
+
+def _default(action: argparse.Action) -> object:
+    """The default of an option, a text read as one of a command line: the name of a file is checked."""
+    default = action.default
+    return action.type(default) if isinstance(default, str) and callable(action.type) else default
 
 
 def _value(action: argparse.Action, value: object) -> object:

@@ -123,7 +123,7 @@ def _command(
     carried_out_by: str = Command.carried_out_by,
 ) -> Command:
     """A row; examples: one a line, without `raytrace NAME`."""
-    start = f"  raytrace {name.replace('wave-', 'wave ')} "
+    start = f"  raytrace {name.replace('wave-', 'wave ').replace('stock-', 'stock ')} "
     text = "\n".join(["examples:", *(start + line.strip() for line in examples.strip().splitlines())])
     return Command(name, summary, description, text, options, run, carried_out_by=carried_out_by)
 
@@ -160,6 +160,10 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("swap_conjugates", None, "", 0, "turn the lens around with object and image: rays are traced backwards"),
     ("insert", None, "BEFORE ROW", "+", "surfaces before one, a row each, as radius=50,thickness=4,glass=N-BK7; "
      "without a row a plane"),
+    ("insert_part", None, "BEFORE PART", "+", "a part of stock before a surface, by its number in the index, or by a "
+     "vendor's file; reversed: turned around; index=stock.sqlite; gap=0 mm behind it"),
+    ("replace_part", None, "SURFACES PART", "+", "a part of stock in the place of an element or a cemented group; "
+     "reversed, index=stock.sqlite"),
     ("delete", None, "SURFACES", "*", "take surfaces out; all others stay in their places"),
     ("join", None, "SURFACES", "*", "take out surfaces that do nothing, and add the thicknesses"),
     ("split", None, "SURFACES", "*", "cut an element into two of the same power together: share=0.5 of the thickness, "
@@ -168,6 +172,52 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
      "without thickness"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
+)  # fmt: skip
+
+_INDEX = "index of parts"
+
+#: Subcommands of `raytrace stock`.
+STOCK_COMMANDS = (
+    _command(
+        "stock-index",
+        "read a folder of vendors' lens files into an index",
+        "Read the parts of vendors' lens files (.zmx, .zar, .seq, .len, .roa) of a folder and its subfolders, or of a "
+        "table of parts (.csv: part, radius_1, thickness_1, glass_1, radius_2, …, diameter, vendor, coating), into one "
+        "file, which suffices without the folder: focal lengths, diameters, shape, glasses, coating, and the content "
+        "of each file. Files without a part are listed with the reason. No data of vendors come with raytrace.",
+        """
+        vendors/thorlabs
+        vendors -o all.sqlite --catalog vendors/special.agf
+        parts.csv -o own.sqlite --json""",
+        Option("folder", file_name, "FOLDER", "folder of lens files, or a table of parts (.csv)", flag="folder"),
+        Option("output", file_of(".sqlite", ".db"), "INDEX", f"{_INDEX} to write: .sqlite, .db", "-o --output",
+               default="stock.sqlite"),
+        "catalog", "json", run="cli.runs:stock_index",
+    ),
+    _command(
+        "stock-find",
+        "parts of an index by their figures",
+        "List the parts of an index by focal length, diameter, shape and glass, the nearest to what is asked for "
+        "first: the distance is the sum of the relative deviations. Lengths are a number, which is met to "
+        "--tolerance, or a range as 45..55 or 25..",
+        """
+        --efl 50 --diameter 25.4 --achromat
+        all.sqlite --efl -60..-40 --shape plano-concave --glass N-SF11
+        --vendor thorlabs --part AC254 --limit 100 -o achromats.csv""",
+        Option("index", file_name, "INDEX", _INDEX, flag="index", nargs="?", default="stock.sqlite"), TABLE, "json",
+        Option("efl", None, "MM", "effective focal length, at the primary wavelength of the file"),
+        Option("bfl", None, "MM", "back focal length, in the orientation of the file"),
+        Option("diameter", None, "MM", "diameter"),
+        Option("tolerance", positive_finite, "PERCENT", "within which a single number is met", default=10.0),
+        Option("elements", count, "N", "number of elements"),
+        switch("achromat", "cemented groups whose power changes by less than 1/200 from F to C"),
+        Option("shape", None, "TEXT", "plano-convex, biconvex, meniscus, plano-concave, biconcave, doublet, …"),
+        Option("glass", None, "GLASS", "glasses that the part has", nargs="+"),
+        Option("part", None, "TEXT", "part of the number"),
+        Option("vendor", None, "TEXT", "part of the vendor's name"),
+        Option("coating", None, "TEXT", "part of the name of the coating"),
+        Option("limit", count, "N", "parts that are listed", default=20), run="cli.runs:stock_find",
+    ),
 )  # fmt: skip
 
 #: Subcommands of `raytrace wave`.
@@ -271,7 +321,9 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
         lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
         lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
-        lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx""",
+        lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx
+        lens.zmx --insert-part 3 AC254-050-A reversed gap=2 -o with_part.zmx
+        lens.zmx --replace-part 1-2 vendor/LA1131-A.zmx reversed -o replaced.zmx""",
         *LENS,
         group(
             "edits, in the order given",
@@ -424,8 +476,10 @@ on request: {", ".join(ON_REQUEST)}""",
         "minimise the merit function of a lens",
         "Optimise a lens by damped least squares on exact derivatives of its merit function: the file's, or the one of "
         "--merit. Solves and pickups hold at every step. --as-built adds the expected spot of the manufactured lens, "
-        "which makes the lens less sensitive to its tolerances. -o writes the lens with its variables and merit "
-        "function. "
+        "which makes the lens less sensitive to its tolerances. With --stock the elements whose curvatures vary are "
+        "replaced by parts of an index, one after the other, each by the best one in its best orientation, and the "
+        "rest is optimised after each; --test-plates likewise sets variable radii to those of a list. The text reports "
+        "what each costs. -o writes the lens with its variables and merit function. "
         "Ctrl-C stops and writes the best lens so far.",
         """
         lens.zmx -o better.zmx --plot better.png
@@ -434,9 +488,18 @@ on request: {", ".join(ON_REQUEST)}""",
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --glasses preferred 'price<=2' -o cheap.zmx
         double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
+        lens.zmx --stock stock.sqlite --vary curvature thickness --hold efl=50 -o of_stock.zmx
+        lens.zmx --test-plates plates.csv -o with_plates.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
         *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses", AS_BUILT,
+        group(
+            "parts of stock and test plates",
+            Option("stock", file_name, "INDEX", "replace elements and cemented groups by parts of this index, which "
+                "`raytrace stock index` makes"),
+            Option("test_plates", file_name, "LIST", "set radii to those of a table of test plates (.csv): radius (mm) "
+                "and shape (CX, CC of the glass), diameter (mm), tolerance, name, where they are known"),
+        ),
         group(
             "stopping",
             Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
@@ -1108,6 +1171,21 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         run="cli.runs:tolerance",
     ),
     _of_module("codesign", codesign, "cli.codesign_run:run"),
+    Command(
+        "stock",
+        "lenses of vendors: an index, and parts by their figures",
+        "An index of the lenses that vendors stock, of their lens files, and its parts by focal length, diameter,\n"
+        "shape and glass. `raytrace edit --insert-part` puts a part into a lens, `raytrace optimize --stock` builds a\n"
+        "lens of parts. "
+        "`raytrace stock SUB --help` shows examples.",
+        """examples:
+  raytrace stock index vendors/thorlabs
+  raytrace stock find --efl 50 --diameter 25.4 --achromat
+  raytrace edit lens.zmx --insert-part 3 AC254-050-A reversed -o with_part.zmx
+  raytrace optimize lens.zmx --stock stock.sqlite --vary curvature thickness -o of_stock.zmx""",
+        (),
+        subcommands=STOCK_COMMANDS,
+    ),
     Command(
         "wave",
         "phase elements: PSFs, design, restoration",

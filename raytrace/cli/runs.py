@@ -35,6 +35,20 @@ def glasses(arguments: argparse.Namespace) -> Result:
     return raytrace.glasses(**options_of(arguments), catalogs=catalogs(arguments))
 
 
+def stock_index(arguments: argparse.Namespace) -> Result:
+    """An index of the parts of a folder; -o is the index."""
+    options = options_of(arguments) | {"output": arguments.output, "catalogs": catalogs(arguments)}
+    result = raytrace.stock_index(**options)
+    say(f"written: {arguments.output}")
+    arguments.output = None
+    return result
+
+
+def stock_find(arguments: argparse.Namespace) -> Result:
+    """The parts of an index that pass a search."""
+    return raytrace.stock_find(**options_of(arguments))
+
+
 def lenses(arguments: argparse.Namespace) -> Result:
     """The shipped lenses and the files of a folder."""
     return list_lenses(arguments.folder)

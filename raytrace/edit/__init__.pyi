@@ -1,3 +1,5 @@
+from raytrace.edit.parts import insert_part as insert_part
+from raytrace.edit.parts import replace_part as replace_part
 from raytrace.edit.scaling import scale as scale
 from raytrace.edit.surfaces import bend as bend
 from raytrace.edit.surfaces import delete as delete

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from raytrace.edit.choice import At, BadEdit, surfaces_at
+from raytrace.edit.parts import insert_part, part_of_words, replace_part
 from raytrace.edit.scaling import scale
 from raytrace.edit.surfaces import bend, delete, insert, join, rename, split
 from raytrace.edit.turning import reverse
@@ -125,6 +126,25 @@ def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     return rename(lens, comments={surfaces: text})
 
 
+def _insert_part(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, part, settings = _part_words(words, chosen, "insert_part", ("gap",))
+    return insert_part(lens, surfaces, part, **settings)
+
+
+def _replace_part(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, part, settings = _part_words(words, chosen, "replace_part", ())
+    return replace_part(lens, surfaces, part, **settings)
+
+
+def _part_words(words: Sequence[str], chosen: str, name: str, known: Sequence[str]) -> tuple[str, Any, dict[str, Any]]:
+    """The surfaces, the part and the settings of a step: [SURFACES] PART [reversed] [index=FILE] …"""
+    plain = [word for word in words if word != "reversed"]
+    surfaces, (part,), settings = _chosen(plain, chosen, name, 1)
+    settings = _known(settings, ("index", *known), name)
+    index = {"index": str(settings.pop("index"))} if "index" in settings else {}
+    return surfaces, part_of_words(part, **index), {**settings, "reverse": len(plain) < len(words)}
+
+
 def _of_surfaces(edit: Callable[[Lens, At], Lens], name: str) -> Callable[[Lens, Sequence[str], str], Lens]:
     return lambda lens, words, chosen: edit(lens, _chosen(words, chosen, name)[0])
 
@@ -138,6 +158,8 @@ STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
     ),
     "swap_conjugates": lambda lens, words, chosen: reverse(lens, swap_conjugates=True),
     "insert": _insert,
+    "insert_part": _insert_part,
+    "replace_part": _replace_part,
     "delete": _of_surfaces(delete, "delete"),
     "join": _of_surfaces(join, "join"),
     "split": _split,

@@ -31,7 +31,7 @@ def insert(lens: Lens, before: At, rows: Iterable[Mapping] = ({"thickness": 0.0}
     k, _ = surfaces_at(lens, before)
     if k == 0:
         raise BadEdit(f"{option('insert')}: no surface is in front of the object; expected 1 to {sensor(lens) + 1}")
-    medium = _medium_before(lens, k)
+    medium = medium_before(lens, k)
     rows = [dict(row) for row in rows]
     new = [
         dataclasses.replace(
@@ -40,15 +40,15 @@ def insert(lens: Lens, before: At, rows: Iterable[Mapping] = ({"thickness": 0.0}
         )
         for number, row in enumerate(rows)
     ]
-    return _inserted(lens, k, new)
+    return inserted(lens, k, new)
 
 
-def _medium_before(lens: Lens, k: int) -> Surface:
+def medium_before(lens: Lens, k: int) -> Surface:
     """The surface whose medium is in front of a surface."""
     return lens.surfaces[medium_surfaces(lens.surfaces)[k - 1]]
 
 
-def _inserted(lens: Lens, k: int, new: Sequence[Surface]) -> Lens:
+def inserted(lens: Lens, k: int, new: Sequence[Surface]) -> Lens:
     """The lens with new surfaces before surface k; the gap before them stays that of the surface before."""
     result = as_inserted(lens, k, len(new)).with_surfaces((*lens.surfaces[:k], *new, *lens.surfaces[k:]))
     check(result)
@@ -93,7 +93,7 @@ def without(lens: Lens, first: int, last: int, rules: Sequence[Vary | Solve] | N
     """
     if rules is None:
         rules = () if lens.optimization_data is None else lens.optimization_data.rules
-    outer = _medium_before(lens, first), lens.surfaces[medium_surfaces(lens.surfaces)[last]]
+    outer = medium_before(lens, first), lens.surfaces[medium_surfaces(lens.surfaces)[last]]
     medium = next((surface for surface in outer if is_air(surface.glass)), outer[0])
     behind: dict[str, Any] = {"glass": medium.glass, "environment": medium.environment}
     before = lens.surfaces[first - 1]
@@ -182,7 +182,7 @@ def _no_dummy(lens: Lens, k: int) -> str:
     if not 1 <= k <= sensor(lens):
         return f"joins no two gaps: expected a surface from 1 to {sensor(lens)}"
     surface, behind = lens.surfaces[k], lens.surfaces[medium_surfaces(lens.surfaces)[k]]
-    before = _medium_before(lens, k)
+    before = medium_before(lens, k)
     if not same(before.glass, behind.glass) or surface.is_mirror:
         return "refracts or reflects; delete it instead"
     if k == lens.stop:
@@ -226,7 +226,7 @@ def split(
     bend, air = (like.new_tensor(n) if not isinstance(n, Tensor) else n for n in (curvature, gap))
     if float(air.detach()) < 0:
         raise BadEdit(f"split {k}-{k + 1}: {option('gap', f'{float(air.detach()):g}')}: expected 0 mm or more")
-    medium, n = _medium_before(lens, k), media(lens, lens.primary)
+    medium, n = medium_before(lens, k), media(lens, lens.primary)
     before, glass, behind = n[k - 1], n[k], n[k + 1]
     parts = share_of * like, (1 - share_of) * like
     bends = vertex_curvature(front), vertex_curvature(lens.surfaces[k + 1])
@@ -239,7 +239,7 @@ def split(
         Surface(air, bend, glass=medium.glass, environment=medium.environment, semi_diameter=front.semi_diameter),
         Surface(parts[1], other, glass=front.glass, environment=front.environment, semi_diameter=front.semi_diameter),
     ]
-    new = _inserted(lens, k + 1, faces)
+    new = inserted(lens, k + 1, faces)
     return new.replace(k, thickness=parts[0])
 
 
@@ -254,9 +254,9 @@ def with_meniscus(lens: Lens, k: int) -> Lens:
         raise BadEdit(f"split: surface {k} {why}")
     surface = lens.surfaces[k]
     thin = dataclasses.replace(surface, thickness=0 * surface.thickness, apertures=(), comment="")
-    around = surface, _medium_before(lens, k)  # behind the two new surfaces
+    around = surface, medium_before(lens, k)  # behind the two new surfaces
     new = [dataclasses.replace(thin, glass=medium.glass, environment=medium.environment) for medium in around]
-    return _inserted(lens, k, new)
+    return inserted(lens, k, new)
 
 
 def bend(lens: Lens, element: At, shape: Tensor | float, *, keep: str = "efl") -> Lens:
@@ -275,7 +275,7 @@ def bend(lens: Lens, element: At, shape: Tensor | float, *, keep: str = "efl") -
     k = _element(lens, surfaces_at(lens, element), "bend")
     front, back = lens.surfaces[k : k + 2]
     before, glass, behind = media(lens, lens.primary)[k - 1 : k + 2]
-    if not same(_medium_before(lens, k).glass, lens.surfaces[k + 1].glass):
+    if not same(medium_before(lens, k).glass, lens.surfaces[k + 1].glass):
         raise BadEdit(f"bend {k}-{k + 1}: is cemented; its faces are those of its neighbours too")
     x = shape if isinstance(shape, Tensor) else front.thickness.new_tensor(shape)
     c = vertex_curvature(front), vertex_curvature(back)

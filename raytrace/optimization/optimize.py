@@ -19,12 +19,14 @@ from raytrace.optimization.between import warn_of_worse, worse_between
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
+from raytrace.optimization.fitting import Design
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths
 from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit
 from raytrace.optimization.opening import Opened, opened
 from raytrace.optimization.optimized import AsBuiltChange, Optimized
+from raytrace.optimization.plate_fit import PlateFit
 from raytrace.optimization.problem import (
     ExpectationSettings,
     NoProblem,
@@ -33,7 +35,10 @@ from raytrace.optimization.problem import (
     typical_of,
 )
 from raytrace.optimization.quantities import Quantity, quantity_of
+from raytrace.optimization.stock_fit import StockFit
 from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, without_glass
+from raytrace.stock.index import parts_of
+from raytrace.stock.plates import TestPlate, read_plates
 from raytrace.system.identity import digest, identity
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
@@ -70,6 +75,8 @@ def optimize(
     paths: int = 1,
     catalog: Sequence[str | PathLike] = (),
     glasses: str | Sequence[str] = "",
+    stock: str | PathLike | None = None,
+    test_plates: str | PathLike | Sequence[TestPlate] | None = None,
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
@@ -94,7 +101,11 @@ def optimize(
     cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
     (`optimization.glass_choice`); glasses: a selection of them, as "preferred price<=3 transmittance:0.4>=0.98", by
-    default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own. log: a file
+    default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own.
+    stock: an index of parts (`rt.stock_index`): the optimised lens takes the best part, in its best orientation, for
+    each element and cemented group with a variable curvature, one after the other, and the rest is optimised after
+    each; test_plates: a list (.csv, `stock.plates.read_plates`), from which each variable radius takes a value likewise
+    (`optimization.fitting`); `Optimized.fitted` reports both. log: a file
     with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
     lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
     rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
@@ -104,7 +115,8 @@ def optimize(
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable), and for spots that are more than 1.5 times as large between the fields, wavelengths or rays
     of the lens as beside them (WorseBetween; `Optimized.between`).
-    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance.
+    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance, BadStock,
+    BadPlates.
     """
     prepare()
     started = time.monotonic()
@@ -118,6 +130,17 @@ def optimize(
     warn_of_filling(lens, field_points(None, like=lens))
     model, chosen = without_glass(design_variables(lens, vary), vary)
     pool = pool_of(lens, catalogs_of(lens, catalog), glasses) if chosen else None
+    is_fitted = stock is not None or test_plates is not None
+    if is_fitted:
+        _refuse_beside_fit(
+            "test_plates" if stock is None else "stock",
+            loss=loss is not None or callable(merit), checkpoint=checkpoint is not None, resume=resume is not None,
+            glass=bool(chosen), as_built=stock is not None and as_built is not None,
+            test_plates=stock is not None and test_plates is not None,
+        )  # fmt: skip
+    plates = read_plates(test_plates) if isinstance(test_plates, str | PathLike) else test_plates
+    if stock is not None:
+        parts_of(stock)  # refused before the work
     names = tuple(variable.name for variable in model.variables)
     if not names:
         raise NoProblem(f"nothing varies: name variables by {option('vary')}, as 'curvature thickness'")
@@ -233,22 +256,46 @@ def optimize(
         )  # fmt: skip
         merit_of_rows, count = float(np.sqrt(descent.state.cost)), len(descent.history)
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
+    fitted, descended, evaluations = None, 0, 0
+    start = dict(zip(names, model.start, strict=True))
+    if is_fitted and not opening.interrupted and descent.stopped != "interrupted":
+        design = Design(problem, lower, upper, descent.state)
+        bar = progress(None, "trial") if progress else None
+        settings: dict[str, Any] = {"cycles": cycles, "until": until, "bar": bar}
+        fit = StockFit(design, stock, **settings) if stock is not None else PlateFit(design, plates or (), **settings)
+        design = fit.run()
+        if bar is not None:
+            bar.close()
+        problem, lower, upper, fitted = design.problem, design.lower, design.upper, fit.report(design)
+        descended, evaluations, fixed = fit.descended, fit.evaluations, fit.fixed(design)
+        data = optimization_data_of(problem.model, problem.rows, problem.unit, held)
+        data = dataclasses.replace(data, variables=tuple(v for v in data.variables if v.address not in fixed))
+        stopped = "interrupted" if fit.interrupted else descent.stopped
+        descent = dataclasses.replace(descent, state=design.state, stopped=stopped)
     x, count = descent.state.x, len(problem.rows)
     after = problem.evaluated(x)
     results = _attained(problem, after, x, lower=lower, upper=upper)
     end = lens_at(x)
     result = _optimized(
-        lens, end, problem.model, x, descent.history, rows=problem.rows,
+        lens, end, problem.model, x, descent.history, rows=problem.rows, start=start,
         merits=(problem.merit(before, model.start), problem.merit(after, x)),
         values=(before.values[:count], after.values[:count]),
         contributions=(before.contributions(np.arange(count)), after.contributions(np.arange(count))),
-        cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
-        evaluations=descent.evaluations + (choice.evaluations if choice else 0),
+        cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0) + descended,
+        evaluations=descent.evaluations + (choice.evaluations if choice else 0) + evaluations,
         stopped="interrupted" if opening.interrupted else descent.stopped, seconds=time.monotonic() - started,
         glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing, conditions=results,
-        as_built=None if term is None else AsBuiltChange.of(term, lens, end),
+        as_built=None if term is None else AsBuiltChange.of(term, lens, end), fitted=fitted,
     )  # fmt: skip
     return _warned(result)
+
+
+def _refuse_beside_fit(fit: str, **given: bool) -> None:
+    """Raise NoProblem for options that do not go with a fit to parts or test plates."""
+    for name, is_given in given.items():
+        if is_given:
+            words = option("vary", "glass") if name == "glass" else option(name)
+            raise NoProblem(f"{words} does not go with {option(fit)}: leave one of them out")
 
 
 def _attained(
@@ -347,11 +394,13 @@ def _optimized(
     *,
     merits: tuple[float, float],
     rows: tuple[Row, ...] = (),
+    start: Mapping[str, float] | None = None,
     values: tuple[Numbers, Numbers] = ((), ()),
     contributions: tuple[Numbers, Numbers] = ((), ()),
     **more: Any,
 ) -> Optimized:
-    """The result; values, contributions: of the rows before and after; more: further fields."""
+    """The result; start: values of the variables before, by name, by default of the model; values, contributions: of
+    the rows before and after; more: further fields."""
 
     def tensor(numbers: Numbers) -> torch.Tensor:
         return torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)
@@ -362,7 +411,7 @@ def _optimized(
         before=lens,
         merit=rows,
         names=tuple(variable.name for variable in model.variables),
-        variables_before=tensor(model.start),
+        variables_before=tensor(model.start if start is None else [start[v.name] for v in model.variables]),
         variables_after=tensor(x),
         values_before=tensor(values[0]),
         values_after=tensor(values[1]),
@@ -383,6 +432,8 @@ def _warned(result: Optimized) -> Optimized:
         if not condition.met:
             warnings.warn(str(condition), NotReached, stacklevel=calling_level())
     warn_of_worse(result.between)
+    if result.fitted is not None:
+        result.fitted.warn()
     for lens in result.lens.configurations:
         warn_of_defects(lens)
     return result

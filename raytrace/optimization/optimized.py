@@ -16,6 +16,7 @@ from raytrace.maths.result import Column, Columns, Result, Table, number, plain
 from raytrace.optimization.attained import Attained, table_of
 from raytrace.optimization.between import Between
 from raytrace.optimization.checkpoint import STOPPED
+from raytrace.optimization.fitting import Fitted
 from raytrace.optimization.glass_choice import GlassStep
 from raytrace.optimization.loss import LossReport
 from raytrace.optimization.merit import configurations_of
@@ -85,7 +86,7 @@ class Optimized(Result):
     glasses were chosen; chosen_from: the glasses that could be chosen. conditions: targets and values reached of
     conditions and boundaries. as_built: spots of the lens as built, if it is a term of the merit, which then includes
     it. loss: the way of a loss, in the place of rows. between: spots between fields, wavelengths or rays that are more
-    than 1.5 times those beside them.
+    than 1.5 times those beside them. fitted: the parts of stock or test plates that the lens has taken.
     """
 
     lens: Lens
@@ -111,6 +112,7 @@ class Optimized(Result):
     as_built: AsBuiltChange | None = None
     loss: LossReport | None = None
     between: tuple[Between, ...] = ()
+    fitted: Fitted | None = None
 
     def draw(self, **options: Any) -> "Figure":
         """One page: lens, spots and merit function before and after."""
@@ -184,6 +186,7 @@ class Optimized(Result):
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
                 **({"chosen_from": self.chosen_from.summary} if self.chosen_from else {}),
+                **({"fitted": self.fitted.document()} if self.fitted else {}),
                 **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
                 **({"loss": dataclasses.asdict(self.loss)} if self.loss else {}),
                 "conditions": [condition.document() for condition in self.conditions],
@@ -216,7 +219,14 @@ class Optimized(Result):
         glasses = []
         if self.glasses:
             glasses = [_glass_table(self.glasses), _chosen_table(self.lens, self.glasses, self.chosen_from)]
-        return [Table(variables, head), *glasses, *([self._lengths()] if self.has_configurations else []), rows]
+        fitted = self.fitted.tables() if self.fitted else []
+        return [
+            Table(variables, head),
+            *glasses,
+            *fitted,
+            *([self._lengths()] if self.has_configurations else []),
+            rows,
+        ]
 
     def _unsharp_start(self) -> list[str]:
         """A line where most rows of the MTF start near zero, where the MTF has side lobes and nearly no slope."""

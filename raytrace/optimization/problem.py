@@ -225,7 +225,10 @@ class Problem(Specification):
 
     def through(self, opening: float) -> "Problem":
         """The problem with rays through a part of pupil and field alone, and without the lens as built."""
-        model = dataclasses.replace(self.model, opening=opening)
+        return self.of(dataclasses.replace(self.model, opening=opening))
+
+    def of(self, model: DesignVariables) -> "Problem":
+        """The problem of the same rows and conditions over another model, without the lens as built."""
         return Problem(model, self.rows, self.conditions, **self._settings)
 
     def with_as_built(self, term: Expectation) -> "Problem":

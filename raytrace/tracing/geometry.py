@@ -206,6 +206,13 @@ def contact_heights(lens: Lens, numbers: Sequence[int]) -> dict[int, Tensor]:
     return {k: torch.where(torch.isfinite(h), h, 0.0) for k, h in clear_semi_diameters(lens, numbers).items()}
 
 
+@torch.no_grad()
+def light_diameter(lens: Lens, numbers: Sequence[int]) -> float:
+    """mm, the largest of the rays on some surfaces from 1, in all configurations, whatever semi-diameters are fixed."""
+    reaches = [_reaches(view, max(numbers))[k - 1] for view in lens.configurations for k in numbers]
+    return 2 * max(float(reach) for reach in reaches if reach == reach)
+
+
 def _reaches(lens: Lens, last: int) -> list[Tensor]:
     """Largest √(x² + y²) mm () of the outermost rays on the surfaces 1 to `last`; nan where none arrives.
 

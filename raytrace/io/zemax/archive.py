@@ -124,6 +124,13 @@ def read(
     return lens
 
 
+def text_of_lens(content: bytes, file: str) -> str:
+    """The text of the lens file of an archive."""
+    member = _lens(members(content, Place(file)), file)
+    place = Place(f"{file} ({member.name})")
+    return decode(unpacked(member, MAX_BYTES, place), place)
+
+
 def members(content: bytes, place: Place) -> list[Member]:
     """The files of an archive, in its order. Raises LensFileError where it is damaged or cut off."""
     packed_files: list[Member] = []
