@@ -50,6 +50,7 @@ PUBLIC = {
     "split": "edit.surfaces",
     "bend": "edit.surfaces",
     "rename": "edit.surfaces",
+    "semi_diameters": "edit.sizes",
     # media
     "AIR": "materials.glass",
     "MIRROR": "materials.glass",

@@ -1,4 +1,5 @@
 from raytrace.edit.scaling import scale as scale
+from raytrace.edit.sizes import semi_diameters as semi_diameters
 from raytrace.edit.surfaces import bend as bend
 from raytrace.edit.surfaces import delete as delete
 from raytrace.edit.surfaces import insert as insert
