@@ -126,7 +126,9 @@ def _semi_diameters(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     settings = _known(dict(word.split("=", 1) for word in words if "=" in word), known, "semi_diameters")
     plain = [word for word in words if "=" not in word]
     if len(plain) > 1:
-        raise BadEdit(f"{option('semi_diameters')} {' '.join(words)}: expected surfaces, as 3-4, and settings, as clear=5")
+        raise BadEdit(
+            f"{option('semi_diameters')} {' '.join(words)}: expected surfaces, as 3-4, and settings, as clear=5"
+        )
     given = {name: _value(text) for name, text in settings.items()}
     if "margin" in settings:
         try:

@@ -65,8 +65,7 @@ _SPELLINGS = {
 _OTHERS = {
     "a focal length follows from the surfaces": "f, fl, efl, focal length, lens focal length, element focal length"
     ", focal length of lens, component focal length, 焦点距離, 焦距, brennweite, focale, distance focale",
-    "a size of the mechanical part": "mech semidia, mech diam, mech dia, mechanical diameter"
-    ", edge thickness, コバ厚",
+    "a size of the mechanical part": "mech semidia, mech diam, mech dia, mechanical diameter, edge thickness, コバ厚",
     "a setting of the program": "ccy, cuc, thc, glc, spe, id no",
     "coatings and heat refract no rays": "coating, cte, specific gravity, density, 比重",
 }

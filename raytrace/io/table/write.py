@@ -37,7 +37,16 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
     """The columns of the table by heading; columns that would be empty are left out."""
     listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
     powers = sorted({n for row in listed for name in row if (n := order(name)) is not None})
-    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", *SIZES[1:], *ENVIRONMENT, "expansion", "comment"]
+    names = [
+        "conic",
+        "semi_diameter",
+        *(f"a{n}" for n in powers),
+        "apertures",
+        *SIZES[1:],
+        *ENVIRONMENT,
+        "expansion",
+        "comment",
+    ]
     used = [name for name in names if any(name in row for row in listed)]
     always = ["surface", "type", "curvature", "thickness", "glass"]
     return {name: [row.get(name, "") for row in listed] for name in always + used}

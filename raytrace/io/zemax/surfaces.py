@@ -1045,7 +1045,9 @@ def build(
         thickness=double(distance),
         semi_diameter=numbers.size,
         chip_zone=_part_size(block, "OEMA", millimetres),
-        mechanical_semi_diameter=_part_size(block, "MEMA", millimetres) if block.integer("MEMA", "code", 0, 1) else None,
+        mechanical_semi_diameter=_part_size(block, "MEMA", millimetres)
+        if block.integer("MEMA", "code", 0, 1)
+        else None,
         comment=comment.text.strip() if comment else "",
         expansion=double(ROWS["TCEX"].read(stated)) if stated else None,
         **fields,
