@@ -26,7 +26,7 @@ def leaves(value, path=""):
 
 
 def assert_same(found, expected):
-    """All numbers bit for bit; semi-diameters of the rays, which a unit need not divide, to a unit of the last digit."""
+    """All numbers bit for bit; semi-diameters of the rays, which a unit need not divide, to the last digit."""
     for one, other in zip(leaves(found), leaves(expected), strict=True):
         is_size = one[0].endswith("semi_diameter") and other[1] is not None
         assert one[1:] == (pytest.approx(other[1:], rel=3e-16) if is_size else other[1:]), one[0]

@@ -162,8 +162,8 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("bend", None, "SURFACES X", "+", "the element of the shape factor X and the same power; keep=thin: its power "
      "without thickness"),
     ("semi_diameters", None, "SURFACES", "*", "semi-diameters by the rays of all fields, wavelengths and "
-     "configurations: margin=2,0.5 per cent and mm beyond the rays; clear=12 mm, fixed, or auto; chip_zone=0.5 mm beyond "
-     "the clear ones; mechanical=12.7 mm of the part, fixed, or auto; of some surfaces, or of all"),
+     "configurations: margin=2,0.5 per cent and mm beyond the rays; clear=12 mm, fixed, or auto; chip_zone=0.5 mm "
+     "beyond the clear ones; mechanical=12.7 mm of the part, fixed, or auto; of some surfaces, or of all"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
 )  # fmt: skip
@@ -327,7 +327,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         ),
         group(
             "mechanical sizes",
-            Option("margin", not_negative, "MM", "of the mechanical semi-diameter beyond the clear one", default=0.0),
+            Option("margin", not_negative, "MM", "added to mechanical semi-diameters that are not fixed", default=0.0),
             Option("chamfer", not_negative, "MM", "legs of the chamfers at edges in air, at 45°", default=0.0),
             Option("substrate", positive_finite, "MM", "thickness of mirrors (default: a sixth of their diameter)"),
         ),

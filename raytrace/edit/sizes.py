@@ -1,4 +1,4 @@
-"""Sizes of surfaces: clear semi-diameters, chip zones and mechanical semi-diameters of a lens or some of its surfaces."""
+"""Clear semi-diameters, chip zones and mechanical semi-diameters of a lens, or of some of its surfaces."""
 
 import dataclasses
 import math
@@ -62,7 +62,7 @@ def semi_diameters(
         width, size = surface.mechanical_semi_diameter, surface.semi_diameter
         if width is not None and size is not None and width < size:
             raise BadEdit(
-                f"semi_diameters: the mechanical semi-diameter of surface {k} is {width:.6g} mm, smaller than its clear "
-                f"one, {size:.6g} mm; expected at least as much, or {AUTO}"
+                f"semi_diameters: the mechanical semi-diameter of surface {k} is {width:.6g} mm, smaller than its "
+                f"clear one, {size:.6g} mm; expected at least as much, or {AUTO}"
             )
     return lens

@@ -129,7 +129,7 @@ def _semi_diameters(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
         raise BadEdit(
             f"{option('semi_diameters')} {' '.join(words)}: expected surfaces, as 3-4, and settings, as clear=5"
         )
-    given = {name: _value(text) for name, text in settings.items()}
+    given: dict[str, Any] = {name: _value(text) for name, text in settings.items()}
     if "margin" in settings:
         try:
             percent, length = (*map(float, settings["margin"].split(",")), 0.0, 0.0)[:2]

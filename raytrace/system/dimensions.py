@@ -175,7 +175,7 @@ _POINTS: dict[str, Power] = {"first": 1, "second": 1}
 
 #: Power of length of every number of a lens that has one, by class and field; a class without a row is not scaled.
 POWERS: dict[str, dict[str, Power]] = {
-    "Surface": {"thickness": 1, "curvature": -1, "coefficients": _of_coefficients} | dict.fromkeys(SIZES, 1),
+    "Surface": {"thickness": 1, "curvature": -1, "coefficients": _of_coefficients, **dict.fromkeys(SIZES, 1)},
     "Aperture": {"extent": 1, "centre": 1},
     "Pose": {"x": 1, "y": 1, "z": 1},
     "GridSag": {"heights": 1, "pitch": 1},

@@ -6,7 +6,7 @@ between two surfaces that refract, reflect or diffract, along the light; glass w
 The edge of glass is at the rim that both of its faces reach, the larger of their clear heights with their chip zones;
 that of air is at the smaller of the rims of the two elements (`rims`). There the thickness is t + z′ - z
 (`edge_thickness`), for checks, boundaries of merit functions and training. OpticStudio takes z and z′ each at the clear
-height of its own surface, and both at that of the first one in a solve: operands and solves of files give these heights.
+height of its own surface, and both at that of the first one in a solve: operands and solves of files do so.
 Flats between the chip zone and the mechanical semi-diameter change no edge.
 
 Frames: position and rotation of every surface in the axes that rays start in.
@@ -184,7 +184,7 @@ def with_missing_semi_diameters(lens: Lens) -> Lens:
 def _stored(
     lens: Lens, data: OptimizationData, fixed: Sequence[int] | None, numbers: Sequence[int] | None = None
 ) -> Lens:
-    """The lens with its clear semi-diameters stored, by default of all surfaces; `fixed` as of `with_semi_diameters`."""
+    """The lens with its clear semi-diameters stored, by default of all surfaces; `fixed`: as there."""
     set_by_others = {
         scaled.path[1] for operand in lens.operands for scaled in operand.paths if scaled.path[-1] == _SIZE
     }

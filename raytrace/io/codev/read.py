@@ -364,7 +364,7 @@ def _surface(
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
     glass, is_break = _medium(block, before, library, report), "BREAK" in comments
-    radius, expansion, *sizes = (
+    radius, expansion, chip_zone, width = (
         number((stated.text or "?").strip(), word.lower(), stated.place) if (stated := comments.get(word)) else None
         for word in ("RADIUS", "EXPANSION", *(name.upper() for name in SIZES[1:]))
     )
@@ -385,7 +385,8 @@ def _surface(
         apertures=apertures,
         comment=unquoted(label.words[0]).strip() if label and label.words else "",
         expansion=None if expansion is None else double(expansion),
-        **{name: None if size is None else size * unit for name, size in zip(SIZES[1:], sizes, strict=True)},
+        chip_zone=None if chip_zone is None else chip_zone * unit,
+        mechanical_semi_diameter=None if width is None else width * unit,
     )
 
 
