@@ -52,6 +52,7 @@ PUBLIC = {
     "split": "edit.surfaces",
     "bend": "edit.surfaces",
     "rename": "edit.surfaces",
+    "semi_diameters": "edit.sizes",
     # parts of vendors
     "stock_find": "stock.index",
     "stock_index": "stock.index",

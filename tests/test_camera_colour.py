@@ -440,6 +440,16 @@ def test_glasses_that_vary_snap_to_the_catalog_and_the_rest_is_learned_again(tri
     assert torch.equal([*other.network.parameters()][-1], [*one.network.parameters()][-1])
 
 
+def test_glasses_of_an_experiment_are_of_the_catalogs_it_is_given(triplet):
+    settings = dataclasses.replace(SETTINGS, vary="index:1,3 abbe_number:1,3 sensor", hold="catalog", relearn=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VariedGlass)
+        one = initial_camera(triplet, settings, catalogs=("OHARA",))
+    other, _ = with_catalog_glasses(one, settings)
+    assert {other.variables().surfaces[k].glass.catalog for k in (1, 3)} == {"OHARA"}
+    assert other.variables.catalog == ("OHARA",)
+
+
 def test_glasses_that_vary_snap_to_selected_glasses(triplet):
     words = "preferred price<=1.5"
     with warnings.catch_warnings():

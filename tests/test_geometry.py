@@ -274,7 +274,7 @@ def test_margins_and_fixed_semi_diameters():
 def test_files_hold_automatic_and_fixed_semi_diameters(name, tmp_path):
     lens = tilted_beams().replace(2, semi_diameter=7.0)
     for design in (lens, lens.with_semi_diameters(margin=(10.0, 0.5)), lens.with_semi_diameters(fixed=[])):
-        rt.write_lens(design.with_semi_diameters(), tmp_path / name)
+        rt.write_lens(design, tmp_path / name)
         again = rt.read_lens(tmp_path / name)
         assert semi_diameters(again) == pytest.approx(semi_diameters(design), rel=1e-14, nan_ok=True)
         assert fixed_semi_diameters(again) == fixed_semi_diameters(design)
@@ -283,7 +283,7 @@ def test_files_hold_automatic_and_fixed_semi_diameters(name, tmp_path):
 
 
 def test_a_lens_without_semi_diameters_writes_and_prints_those_of_its_rays(tmp_path):
-    rt.write_lens(tilted_beams().with_semi_diameters(), tmp_path / "plate.zmx")
+    rt.write_lens(tilted_beams(), tmp_path / "plate.zmx")
     lines = [line.split() for line in (tmp_path / "plate.zmx").read_text().splitlines() if "DIAM" in line]
     assert [float(words[1]) for words in lines[1:]] == pytest.approx(heights_behind(5.0), rel=1e-13)
     assert [words[2] for words in lines] == ["0"] * 4
@@ -294,7 +294,7 @@ def test_a_lens_without_semi_diameters_writes_and_prints_those_of_its_rays(tmp_p
 
 def test_a_zoom_lens_writes_the_largest_of_all_configurations(tmp_path):
     zoom = tilted_beams().with_configurations(thickness={1: [5.0, 8.0]})
-    rt.write_lens(zoom.with_semi_diameters(), tmp_path / "zoom.zmx")
+    rt.write_lens(zoom, tmp_path / "zoom.zmx")
     again = rt.read_lens(tmp_path / "zoom.zmx")
     assert (tmp_path / "zoom.zmx").read_text().count(" 3 0 0 1 ") == 3  # the code of the largest of all
     assert semi_diameters(again)[1:] == pytest.approx(heights_behind(8.0), rel=1e-13)

@@ -50,6 +50,9 @@ def test_every_type_has_its_entries_in_the_document(name):
         "indices",
         "semi_diameter",
         "semi_diameter_is_fixed",
+        "chip_zone",
+        "mechanical_semi_diameter",
+        "mechanical_semi_diameter_is_fixed",
         "comment",
     }
     found = rt.info(lens).document()["surfaces"]

@@ -276,3 +276,10 @@ def test_what_is_no_solid_of_revolution_is_reported():
         rt.draw("spectrometer", elements=[3])
     with pytest.raises(NoSolid, match="positive edge"):
         rt.draw(singlet({"thickness": 1.0}))
+
+
+def test_every_file_of_several_sheets_is_reported(run, tmp_path):
+    outcome = run("draw", "cooke_triplet", "--elements", "1", "2", "-o", tmp_path / "parts.svg")
+    assert sorted(path.name for path in tmp_path.glob("*.svg")) == ["parts_1.svg", "parts_2.svg"]
+    assert [f"parts_{k}.svg" in outcome.err for k in (1, 2)] == [True, True]
+    assert "parts.svg" not in outcome.err

@@ -18,7 +18,7 @@ from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens, media
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_posed, sag_at
-from raytrace.tracing.geometry import Frame, edge_radius, frames, semi_diameters
+from raytrace.tracing.geometry import Frame, edge_radius, frames, polished_semi_diameters
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps, points_on_surfaces
 
@@ -144,8 +144,11 @@ def heights(*radii: float) -> np.ndarray:
 
 
 def drawn_radii(lens: Lens, stop: float | None = None) -> list[float]:
-    """Radius in mm to which every surface is drawn: its clear semi-diameter; stop: that of the stop, if it is known."""
-    radii = [0.0 if math.isnan(size) else size for size in semi_diameters(lens)]
+    """Radius in mm to which every surface is drawn: its clear semi-diameter with its chip zone.
+
+    stop: that of the stop, if it is known.
+    """
+    radii = [0.0 if math.isnan(size) else size for size in polished_semi_diameters(lens)]
     stop = abs(float(stop_radius(lens)) if stop is None else stop)
     if math.isfinite(stop):
         radii[lens.stop] = max(radii[lens.stop], stop)
@@ -156,8 +159,18 @@ def drawn_radii(lens: Lens, stop: float | None = None) -> list[float]:
     ]
 
 
-def glass(lens: Lens, number: int, places: list[Section], radii: list[float], indices: list[float]) -> Outline | None:
-    """Outline in the picture of the glass behind a surface; None where the glass has no thickness."""
+def glass(
+    lens: Lens,
+    number: int,
+    places: list[Section],
+    radii: list[float],
+    indices: list[float],
+    widths: Sequence[float],
+) -> Outline | None:
+    """Outline in the picture of the glass behind a surface; None where the glass has no thickness.
+
+    radii: mm, `drawn_radii`; widths: mm, `tracing.geometry.mechanical_semi_diameters`.
+    """
     back = partner(lens, number)
     front, behind = places[number], places[back]
     within = front.along @ (behind.origin - front.origin), front.across @ (behind.origin - front.origin)
@@ -168,11 +181,12 @@ def glass(lens: Lens, number: int, places: list[Section], radii: list[float], in
     if within[0] == 0:
         return None
     if back + 1 == len(lens.surfaces):  # glass up to the image, which has no rim of its own
-        outline = element(*pair, 0.0, within[0], (radii[number],) * 2, (False, False), front.direction)
+        outline = element(*pair, 0.0, within[0], (radii[number],) * 2, (False, False), 0.0, front.direction)
     else:
         glassy = indices[number - 1] > GLASSY, indices[back] > GLASSY
         cemented = glassy[0] and not pair[0].is_mirror, back + 1 < len(lens.surfaces) and glassy[1]
-        outline = element(*pair, 0.0, within[0], (radii[number], radii[back]), cemented, front.direction)
+        rim = max((width for width in (widths[number], widths[back]) if not math.isnan(width)), default=0.0)
+        outline = element(*pair, 0.0, within[0], (radii[number], radii[back]), cemented, rim, front.direction)
     return front.at(*outline)
 
 
@@ -194,15 +208,16 @@ def element(
     z_back: float,
     radii: tuple[float, float],
     cemented: tuple[bool, bool],
+    width: float = 0.0,
     direction: tuple[float, float] = (0.0, 1.0),
 ) -> Outline:
-    """Outline (z, y) of the glass between two surfaces, each drawn to its own radius.
+    """Outline (z, y) of the glass between two surfaces, each drawn to its own radius; width: mm, that of the glass.
 
     The smaller surface continues to the rim of the larger: flat, as it is ground, or along its sag where it is cemented
     or where a flat would cut the other surface; otherwise the rim is where the two surfaces meet.
     """
-    rim = max(radii)
-    y = heights(*radii)
+    rim = max(*radii, width)
+    y = heights(*radii, rim)
     forward = math.copysign(1.0, z_back - z_front)
     outlines = []
     for ends in continuations((front, back), radii, rim, cemented):

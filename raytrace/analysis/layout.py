@@ -29,7 +29,7 @@ from raytrace.system.lens import (
 )
 from raytrace.system.phases import IdealLens
 from raytrace.system.surface import Surface
-from raytrace.tracing.geometry import edge_radius, warn_of_defects
+from raytrace.tracing.geometry import edge_radius, mechanical_semi_diameters, warn_of_defects
 from raytrace.tracing.launch import launch, stop_radius, warn_of_filling
 from raytrace.tracing.lens_report import Info, text
 from raytrace.tracing.trace import trace_lens
@@ -255,7 +255,7 @@ def _drawn(
     with torch.no_grad():
         stop = float(stop_radius(lens))
         places, radii = cross_section.sections(lens, view), cross_section.drawn_radii(lens, stop)
-        indices = [float(index) for index in media(lens, wavelengths[0])]
+        indices, widths = [float(index) for index in media(lens, wavelengths[0])], mechanical_semi_diameters(lens)
         right, up = _extent(lens, places, radii)
         first, last = right
         distance = float(lens.surfaces[0].thickness)
@@ -272,7 +272,7 @@ def _drawn(
                 lens, points, fields=fields, wavelength=wavelength, z_start=start, view=view
             )
 
-        _draw_glass(axes, lens, places, radii, indices)
+        _draw_glass(axes, lens, places, radii, indices, widths)
         _draw_mirrors(axes, lens, places, radii, paths)
         _draw_apertures(axes, lens, places, radii)
         _draw_stop(axes, lens, places, radii, stop)
@@ -281,7 +281,7 @@ def _drawn(
         half = _draw_sensor(axes, lens, places[-1], radii, paths)
         if near:
             _draw_object(axes, lens, places[0], paths)
-    largest, (low, high) = max(radii[1:-1]), _ray_heights(paths)
+    largest, (low, high) = max(*radii[1:-1], *(w for w in widths[1:-1] if w > 0)), _ray_heights(paths)
     rim = radii[lens.stop] + 0.18 * largest
     heights = min(low, -largest, -half, -rim), max(high, largest, half, rim)
     return _Drawn(places, bent, (min(first, start), last), heights)
@@ -313,11 +313,13 @@ def _front(places: Places, radii: list[float], lens: Lens) -> float:
     return float(min(0.0, *places[1].at(cross_section.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
 
 
-def _draw_glass(axes: style.Axes, lens: Lens, places: Places, radii: list[float], indices: list[float]) -> None:
+def _draw_glass(
+    axes: style.Axes, lens: Lens, places: Places, radii: list[float], indices: list[float], widths: list[float]
+) -> None:
     for k in range(1, len(places) - 1):
         if indices[k] <= cross_section.GLASSY or lens.surfaces[k].is_break:
             continue
-        shape = cross_section.glass(lens, k, places, radii, indices)
+        shape = cross_section.glass(lens, k, places, radii, indices, widths)
         if shape is not None:
             colour = style.tint(indices[k])
             axes.fill(*shape, facecolor=colour, edgecolor=style.INK, linewidth=0.7, zorder=2, gid=f"glass {k}")

@@ -89,7 +89,8 @@ def open_experiment(
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
     field_points(settings.fields, like=lens)  # refuses angles of 90 degrees
     try:
-        initial_camera(lens, settings)  # refuses bad variables, starts and networks
+        # refuses bad variables, starts and networks
+        initial_camera(lens, settings, catalogs=catalogs(arguments))
     except NoImage as error:
         message = "give --near, --far and --focus-distance beyond the focal length"
         raise CommandError(f"{arguments.lens}: {error}; {message}") from error
@@ -108,10 +109,16 @@ def open_experiment(
         samples, kind = pictures_of(arguments, least, lambda: _leaves(*leaves), colour=colour)
         parts, pictures = split(samples), digest(samples.samples)
     about = {
-        "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
+        "lens": f"{path.stem}, sha256 {_sha256(path)}",
         "pictures": pictures,
     }
+    if arguments.catalog and (settings.relearn or "catalog" in settings.hold.split()):  # glasses are chosen from them
+        about["catalogs"] = ", ".join(f"{path.stem}, sha256 {_sha256(path)}" for path in catalogs(arguments))
     return Experiment(lens, path.stem, settings, *parts, about, kind, catalogs(arguments), arguments.device)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _leaves(count: int, size: int, colour: bool) -> Pictures:
@@ -414,7 +421,7 @@ def _spectral(arguments: argparse.Namespace) -> None:
     if settings.is_toleranced:
         raise CommandError("--as-built, --grade and --limits belong to training; leave them out, or --loss spectral")
     experiment = open_experiment(arguments, settings)
-    optimum = closed_form(experiment.lens, experiment.settings, experiment.spectrum())
+    optimum = closed_form(experiment.lens, experiment.settings, experiment.spectrum(), catalogs=experiment.catalogs)
     for name in optimum.at_end:
         say(f"warning: {name} ends at a bound, and the loss still falls beyond it")
     result = CodesignResult(experiment, optimum, {"closed form": optimum.course})

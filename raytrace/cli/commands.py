@@ -170,6 +170,9 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
      "gap=0 mm, curvature=0 of the first face; of one surface: a meniscus without thickness before it"),
     ("bend", None, "SURFACES X", "+", "the element of the shape factor X and the same power; keep=thin: its power "
      "without thickness"),
+    ("semi_diameters", None, "SURFACES", "*", "semi-diameters by the rays of all fields, wavelengths and "
+     "configurations: margin=2,0.5 per cent and mm beyond the rays; clear=12 mm, fixed, or auto; chip_zone=0.5 mm "
+     "beyond the clear ones; mechanical=12.7 mm of the part, fixed, or auto; of some surfaces, or of all"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
 )  # fmt: skip
@@ -304,7 +307,7 @@ COMMANDS = (
     ),
     _command(
         "edit",
-        "scale, reverse, split, bend, insert and delete",
+        "scale, reverse, split, bend, insert, delete, semi-diameters",
         """\
 Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
 have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
@@ -320,6 +323,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         relay.zmx --swap-conjugates -o backwards.zmx
         cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
         lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
+        lens.zmx --semi-diameters margin=2,0.5 chip_zone=0.5 --semi-diameters 1-2 mechanical=12.7 -o sized.zmx
         lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
         lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx
         lens.zmx --insert-part 3 AC254-050-A reversed gap=2 -o with_part.zmx
@@ -380,7 +384,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         ),
         group(
             "mechanical sizes",
-            Option("margin", not_negative, "MM", "of the mechanical semi-diameter beyond the clear one", default=0.0),
+            Option("margin", not_negative, "MM", "added to mechanical semi-diameters that are not fixed", default=0.0),
             Option("chamfer", not_negative, "MM", "legs of the chamfers at edges in air, at 45°", default=0.0),
             Option("substrate", positive_finite, "MM", "thickness of mirrors (default: a sixth of their diameter)"),
         ),

@@ -314,7 +314,8 @@ def save(result: Result, arguments: argparse.Namespace) -> None:
                 result.plot(path, **drawing) if name == "plot" else result.save(path)
             except raytrace.NothingToShow as error:
                 raise CommandError(f"{arguments.lens}: {error}") from error
-            say(f"written: {path}")
+            for file in [path] if name == "plot" else result.files(path):
+                say(f"written: {file}")
 
 
 def print_json(document: dict) -> None:

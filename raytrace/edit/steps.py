@@ -6,6 +6,7 @@ from typing import Any
 from raytrace.edit.choice import At, BadEdit, surfaces_at
 from raytrace.edit.parts import insert_part, part_of_words, replace_part
 from raytrace.edit.scaling import scale
+from raytrace.edit.sizes import semi_diameters
 from raytrace.edit.surfaces import bend, delete, insert, join, rename, split
 from raytrace.edit.turning import reverse
 from raytrace.maths.numerics import value
@@ -121,6 +122,25 @@ def _bend(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     return bend(lens, surfaces, factor, **_known(settings, ("keep",), "bend"))
 
 
+def _semi_diameters(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    known = ("clear", "margin", "chip_zone", "mechanical")
+    settings = _known(dict(word.split("=", 1) for word in words if "=" in word), known, "semi_diameters")
+    plain = [word for word in words if "=" not in word]
+    if len(plain) > 1:
+        raise BadEdit(
+            f"{option('semi_diameters')} {' '.join(words)}: expected surfaces, as 3-4, and settings, as clear=5"
+        )
+    given: dict[str, Any] = {name: _value(text) for name, text in settings.items()}
+    if "margin" in settings:
+        try:
+            percent, length = (*map(float, settings["margin"].split(",")), 0.0, 0.0)[:2]
+        except ValueError as error:
+            message = f"margin={settings['margin']}: expected per cent and mm, as 2,0.5"
+            raise BadEdit(f"{option('semi_diameters')} {message}") from error
+        given["margin"] = percent, length
+    return semi_diameters(lens, plain[0] if plain else chosen or None, **given)
+
+
 def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     surfaces, text = (chosen, words[0]) if len(words) == 1 and chosen else (words[0], " ".join(words[1:]))
     return rename(lens, comments={surfaces: text})
@@ -164,6 +184,7 @@ STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
     "join": _of_surfaces(join, "join"),
     "split": _split,
     "bend": _bend,
+    "semi_diameters": _semi_diameters,
     "rename": lambda lens, title, chosen: rename(lens, title),
     "comment": _comment,
 }

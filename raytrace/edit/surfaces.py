@@ -315,8 +315,10 @@ def _objection(lens: Lens, k: int) -> str:
     if not 1 <= k <= sensor(lens):
         return f"is none of this lens, which has surfaces 1 to {sensor(lens)} between object and image"
     surface = lens.surfaces[k]
-    if surface.is_mirror or surface.phase is not None:
-        return "is a mirror" if surface.is_mirror else "has a phase"
+    if surface.is_mirror:
+        return "is a mirror, whose power and shape are those of one face: give it another radius instead"
+    if surface.phase is not None:
+        return "has a phase"
     return "is tilted or decentred, or a coordinate break" if is_posed(surface) else ""
 
 

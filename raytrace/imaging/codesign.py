@@ -14,6 +14,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -104,8 +105,11 @@ def lens_at_start(lens: Lens, settings: CodesignSettings) -> Lens:
         ) from error
 
 
-def variables(lens: Lens, settings: CodesignSettings) -> Variables:
-    """The variables of an experiment at its start, with their bounds and the limits of thicknesses."""
+def variables(lens: Lens, settings: CodesignSettings, *, catalogs: Sequence[str | PathLike] = ()) -> Variables:
+    """The variables of an experiment at its start, with their bounds and the limits of thicknesses.
+
+    catalogs: names or AGF files of the glasses that may be chosen, by default those of the lens.
+    """
     return Variables(
         lens_at_start(lens, settings),
         settings.vary,
@@ -115,6 +119,7 @@ def variables(lens: Lens, settings: CodesignSettings) -> Variables:
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,
         glasses=settings.glasses,
+        catalog=catalogs,
         step=settings.step,
     )
 
@@ -185,14 +190,16 @@ def model_at(name: str, settings: CodesignSettings) -> Model:
     return model_of(name) if points is None else model_of(name, rays=points)
 
 
-def initial_camera(lens: Lens, settings: CodesignSettings) -> Camera[Variables]:
-    """The camera of an experiment at its start."""
+def initial_camera(
+    lens: Lens, settings: CodesignSettings, *, catalogs: Sequence[str | PathLike] = ()
+) -> Camera[Variables]:
+    """The camera of an experiment at its start; catalogs: as of `variables`."""
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     if settings.turns and settings.optimizer != "lm":
         raise ValueError(f"turns {settings.turns} with optimizer {settings.optimizer!r}: expected optimizer lm")
     return Camera(
-        variables(lens, settings),
+        variables(lens, settings, catalogs=catalogs),
         network_at_start(settings),
         sensor=sensor_at_start(settings),
         model=model_at(settings.model, settings),
@@ -222,7 +229,7 @@ def with_catalog_glasses(
     again = dataclasses.replace(
         settings, vary=" ".join(words), hold=hold, epochs=settings.relearn, start=repr(sensor), relearn=0
     )
-    with_glasses = initial_camera(lens, again)
+    with_glasses = initial_camera(lens, again, catalogs=trained.variables.catalog)
     with_glasses.network.load_state_dict(trained.network.state_dict())
     with_glasses.plan()
     return with_glasses, again
@@ -589,8 +596,9 @@ def run_model(
     """Both steps of one model and seed, a training step at a time: (name of the step, number, record of the log).
 
     folder: of this run, resumed if started; about: other inputs that determine the result (lens file, pictures);
-    progress: wraps the batches of every test; catalogs: of glass, with which the lens was read; device: of the
-    training. At the end the optimised lens is written to `lens.zmx` there, and the outcome to `outcome.json`, read by
+    progress: wraps the batches of every test; catalogs: of glass, with which the lens was read and from which glasses
+    are chosen; device: of the training. At the end the optimised lens is written to `lens.zmx` there, and the outcome
+    to `outcome.json`, read by
     `outcome`.
     """
     folder = Path(folder)
@@ -611,7 +619,7 @@ def run_model(
     current = run(STEPS[0])
     if (folder / "outcome.json").exists():
         return
-    trained = initial_camera(lens, settings).to(device)
+    trained = initial_camera(lens, settings, catalogs=catalogs).to(device)
     trained.plan()  # before a checkpoint moves the lens, so that a resumed run has the same PSFs
     begin(trained, settings, current)
     for step, record in optimise(trained, train_pictures, settings, current):
@@ -734,16 +742,22 @@ def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spect
     """Move the lens of a camera to an optimum of the closed form: by steps of second order for the optimizer "lm", else
     to the optimum named by `start`: of the PSF model of the experiment, or of the Gaussian model."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
-    first = initial_camera(trained.variables.lens, dataclasses.replace(settings, model=model))
+    alike = dataclasses.replace(settings, model=model)
+    first = initial_camera(trained.variables.lens, alike, catalogs=trained.variables.catalog)
     distances = even_distances(first, spread=settings.spread)
     course, _ = least_of_closed_form(first, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer])
     trained.variables.load_state_dict(first.variables.state_dict())
     return course
 
 
-def closed_form(lens: Lens, settings: CodesignSettings, spectrum: Tensor) -> Optimum:
-    """The optimum of the model of the settings. spectrum: `patch_spectrum` of the pictures."""
-    optimised = initial_camera(lens, settings)
+def closed_form(
+    lens: Lens, settings: CodesignSettings, spectrum: Tensor, *, catalogs: Sequence[str | PathLike] = ()
+) -> Optimum:
+    """The optimum of the model of the settings.
+
+    spectrum: `patch_spectrum` of the pictures; catalogs: as of `variables`.
+    """
+    optimised = initial_camera(lens, settings, catalogs=catalogs)
     if settings.start == GAUSSIAN:
         to_closed_form(optimised, settings, spectrum)
     distances = even_distances(optimised, spread=settings.spread)

@@ -63,7 +63,7 @@ from raytrace.system.parameter_paths import (
     with_number,
 )
 from raytrace.system.surface import medium_surfaces, sag_at
-from raytrace.tracing.geometry import edge_thickness, gaps, rims
+from raytrace.tracing.geometry import clear_semi_diameters, edge_thickness, gaps, rims, semi_diameters
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot import image_rays
 from raytrace.wave_optics.element import Element
@@ -93,8 +93,8 @@ def limits_of(
     edge: float | None = None,
 ) -> Limits:
     """Limits, mm. Defaults relative to the largest diameter of the lens: glass at least 1/50, at its edge 1/100, air
-    between elements 1/2000, no maximum. A lens without semi-diameters gets 0."""
-    diameter = 2 * max((surface.semi_diameter or 0.0) for surface in lens.surfaces[1:-1])
+    between elements 1/2000, no maximum."""
+    diameter = 2 * max((size for size in semi_diameters(lens)[1:-1] if size > 0), default=0.0)
     return Limits(
         glass=(_GLASS * diameter, math.inf) if glass is None else glass,
         air=(_AIR * diameter, math.inf) if air is None else air,
@@ -117,13 +117,19 @@ def violation(lens: Lens, limits: Limits | None = None) -> Tensor:
 
 
 def _shortfalls(lens: Lens, limits: Limits) -> Iterator[Tensor]:
-    """Shortfall of each thickness, on the axis and at the edge; negative where its limit is met."""
+    """Shortfall of each thickness, on the axis and at the edge; negative where its limit is met.
+
+    Automatic semi-diameters follow the rays, with their derivatives.
+    """
     surfaces, last = lens.surfaces, len(lens.surfaces) - 1
     spaces, ends = gaps(lens, to_image=True), np.arange(last + 1)
     in_air = np.array([is_air(surfaces[k].glass) for k in medium_surfaces(surfaces)])
     for start, end, _ in spaces:
         ends[start] = end
-    sizes = np.array([surface.semi_diameter or math.nan for surface in surfaces])
+    # The image has a rim only where its semi-diameter is stored.
+    numbers = [k for k in range(1, last) if not surfaces[k].is_break] + [last] * bool(surfaces[last].semi_diameter)
+    heights = {k: h + (surfaces[k].chip_zone or 0.0) for k, h in clear_semi_diameters(lens, numbers).items()}
+    sizes = np.array([float(heights[k].detach()) if k in heights else math.nan for k in range(last + 1)])
     edges = rims(sizes, ends, ~in_air & (ends > np.arange(last + 1)))
     for start, end, side in spaces:
         least, most = limits.air if in_air[start] else limits.glass
@@ -132,7 +138,7 @@ def _shortfalls(lens: Lens, limits: Limits) -> Iterator[Tensor]:
         if math.isfinite(most) and not (in_air[start] and end == last):
             yield side * thickness - most
         if math.isfinite(edges[start]):
-            y = thickness.new_tensor(edges[start])
+            y = heights[int(np.flatnonzero(sizes == edges[start])[0])]
             front, back = (sag_at(surfaces[k], torch.zeros_like(y), y) for k in (start, end))
             yield (0.0 if in_air[start] else limits.edge) - side * edge_thickness(thickness, front, back)
 

@@ -287,7 +287,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
 
     Glasses with index errors are written as melts into a glass catalog beside a .zmx file or a table, as
     worst-melts.agf of worst.zmx, which readers find there (`io.melts`). Semi-diameters are written as the lens
-    stores them; `Lens.with_semi_diameters` stores those that the rays give.
+    stores them, and by the rays where it stores none; `Lens.with_semi_diameters` stores all automatic ones anew.
     catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
     cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
     and other data that the file does not bring back.
@@ -300,6 +300,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     form = _format(path, WRITTEN)
     if is_posed(lens.surfaces[0]):
         raise LensFileError(TILTED_OBJECT, place._replace(surface=0))
+    lens = lens.with_missing_semi_diameters()
     plain, melts = with_melts(lens, path) if form.catalogs else (lens, None)
     with tempfile.TemporaryDirectory() as folder:
         if melts is not None:  # where readers look for it

@@ -35,7 +35,7 @@ from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import OF_LENS, modelled, parse_bounds, path_of
 from raytrace.system.poses import Pose, undone
-from raytrace.system.surface import SHAPE, Surface
+from raytrace.system.surface import SHAPE, SIZES, Surface
 from raytrace.words import option
 
 #: More characters than the name of any glass has.
@@ -395,7 +395,7 @@ def _refuse_overflow(lens: Lens, file: str) -> None:
 
     for k, surface in enumerate(lens.surfaces):
         numbers = [getattr(surface, name) for name in SHAPE if name != "kind"]
-        numbers += [surface.phase, surface.before, surface.after, surface.semi_diameter]
+        numbers += [surface.phase, surface.before, surface.after, *(getattr(surface, name) for name in SIZES)]
         numbers += [surface.thickness] if k else []
         numbers += [(*aperture.extent, *aperture.centre) for aperture in surface.apertures]
         if not finite(numbers):

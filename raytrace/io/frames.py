@@ -12,8 +12,9 @@ from raytrace.io.table.system import written
 from raytrace.io.table.text import Table, add_metadata, add_row, header
 from raytrace.io.table.write import rows
 from raytrace.system.lens import Lens
+from raytrace.system.surface import SIZES
 
-_NUMERIC = ("curvature", "thickness", "conic", "semi_diameter")
+_NUMERIC = ("curvature", "thickness", "conic", *SIZES)
 _PLACE = Place("DataFrame")
 
 

@@ -133,6 +133,10 @@ class Result:
                 f"{os.fspath(path)}: a result is saved as .csv or .json; figures are saved by {option('plot')}"
             )
 
+    def files(self, path: str | PathLike) -> list[Path]:
+        """The files that `save` writes."""
+        return [Path(path)]
+
     def document(self) -> dict:
         """The result for JSON: plain numbers, null for undefined ones."""
         return {"results": rows(self.columns())}

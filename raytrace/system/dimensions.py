@@ -16,6 +16,7 @@ from raytrace.maths.bivariate import powers as powers_xy
 from raytrace.maths.numerics import is_any
 from raytrace.system.optimization_data import Row
 from raytrace.system.shapes import KINDS
+from raytrace.system.surface import SIZES
 
 #: Names by unit; "" of pure numbers, of lines that set something, and of values on other rows, whose unit they have.
 _UNITS = {
@@ -174,7 +175,7 @@ _POINTS: dict[str, Power] = {"first": 1, "second": 1}
 
 #: Power of length of every number of a lens that has one, by class and field; a class without a row is not scaled.
 POWERS: dict[str, dict[str, Power]] = {
-    "Surface": {"thickness": 1, "curvature": -1, "coefficients": _of_coefficients, "semi_diameter": 1},
+    "Surface": {"thickness": 1, "curvature": -1, "coefficients": _of_coefficients, **dict.fromkeys(SIZES, 1)},
     "Aperture": {"extent": 1, "centre": 1},
     "Pose": {"x": 1, "y": 1, "z": 1},
     "GridSag": {"heights": 1, "pitch": 1},
@@ -213,7 +214,7 @@ def power_at(whole: Any, path: Sequence[str | int | tuple[int, ...]]) -> int:
 def scaled(part: Any, factor: Tensor | float, power: int | list[int] = 0) -> Any:
     """A part of a lens with every number multiplied by factor^power, and every number of its parts by its own power.
 
-    A distance that is inf stays so; a semi-diameter, which is a plain number, has no derivative by the factor.
+    A distance that is inf stays so; semi-diameters, which are plain numbers, have no derivative by the factor.
     """
     if isinstance(part, tuple):
         entries = tuple(scaled(entry, factor, power) for entry in part)
@@ -224,7 +225,7 @@ def scaled(part: Any, factor: Tensor | float, power: int | list[int] = 0) -> Any
             before, by = getattr(part, field.name), POWERS.get(type(part).__name__, {}).get(field.name, 0)
             after = scaled(before, factor, by(part) if callable(by) else by)
             if after is not before:
-                is_plain = field.name == "semi_diameter" and isinstance(after, Tensor)
+                is_plain = field.name in SIZES and isinstance(after, Tensor)
                 changes[field.name] = float(after.detach()) if is_plain else after
         return dataclasses.replace(part, **changes) if changes else part
     if not isinstance(part, Tensor | float) or not power:

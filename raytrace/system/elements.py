@@ -1,4 +1,7 @@
-"""Elements and cemented groups of a lens: found from the media between its surfaces, mirrors and phases."""
+"""Elements and cemented groups of a lens, from the media between its surfaces, mirrors and phases; their diameters."""
+
+import math
+from collections.abc import Sequence
 
 import torch
 
@@ -39,6 +42,30 @@ def cemented_groups(lens: Lens) -> list[tuple[int, int]]:
         else:
             groups.append([element])
     return [(group[0][0], group[-1][1]) for group in groups if len(group) > 1]
+
+
+def polished_semi_diameters(lens: Lens, clear: Sequence[float]) -> list[float]:
+    """mm of every surface, of its `clear` semi-diameter in mm and its chip zone: up to there it follows its sag."""
+    return [size + (surface.chip_zone or 0.0) for size, surface in zip(clear, lens.surfaces, strict=True)]
+
+
+def mechanical_semi_diameters(lens: Lens, clear: Sequence[float]) -> list[float]:
+    """mm of the part at every surface, of `clear` semi-diameters in mm; nan where they are unknown.
+
+    Fixed ones as stored; the others are the largest of the polished and the fixed ones of the element, or of the
+    cemented group (all automatic ones that OpticStudio stores in public files).
+    """
+    polished = polished_semi_diameters(lens, clear)
+    sizes = [s.mechanical_semi_diameter or size for s, size in zip(lens.surfaces, polished, strict=True)]
+    if lens.optimization_data is not None and not lens.optimization_data.shares_mechanical:
+        return sizes
+    result = list(sizes)
+    for first, last in [*lens_elements(lens), *cemented_groups(lens)]:
+        faces = [k for k in range(first, last + 1) if not lens.surfaces[k].is_break]
+        widest = max((sizes[k] for k in faces if not math.isnan(sizes[k])), default=math.nan)
+        for k in faces:
+            result[k] = lens.surfaces[k].mechanical_semi_diameter or widest
+    return result
 
 
 def _media(lens: Lens) -> list[Glass]:

@@ -22,7 +22,7 @@ from torch import Tensor
 from raytrace.materials.glass import Glass, is_air, label
 from raytrace.system.apertures import Aperture
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface, medium_surfaces, sag_at
+from raytrace.system.surface import SIZES, Surface, medium_surfaces, sag_at
 
 _UNIT = 1e-6  # of coefficients, 1/K
 
@@ -114,7 +114,7 @@ def _edges(surfaces: Sequence[Surface], k: int, heights: Mapping[int, Tensor]) -
 
 
 def _grown(surface: Surface, s: Tensor) -> Surface:
-    """A surface whose shape, decentres, apertures and semi-diameter are s times as large."""
+    """A surface whose shape, decentres, apertures and sizes are s times as large."""
     size, changes = float(s.detach().mean()), dict[str, Any]()
     if surface.curvature is not None:
         changes["curvature"] = surface.curvature / s
@@ -127,8 +127,9 @@ def _grown(surface: Surface, s: Tensor) -> Surface:
     for name in ("phase", "before", "after"):
         if (held := getattr(surface, name)) is not None:
             changes[name] = _lengthened(held, s, _LENGTHS)
-    if surface.semi_diameter is not None:
-        changes["semi_diameter"] = size * surface.semi_diameter
+    for name in SIZES:
+        if (length := getattr(surface, name)) is not None:
+            changes[name] = size * length
     changes["apertures"] = tuple(_larger(aperture, size) for aperture in surface.apertures)
     return dataclasses.replace(surface, **changes)
 

@@ -32,7 +32,7 @@ from raytrace.system.expansion import expanded, growth, in_contact, is_solid, un
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface, is_posed, is_round, medium_surfaces
+from raytrace.system.surface import SIZES, Surface, is_posed, is_round, medium_surfaces
 from raytrace.words import both_spellings, calling_level, did_you_mean, option
 
 if TYPE_CHECKING:
@@ -556,7 +556,7 @@ class Lens:
     def with_semi_diameters(
         self, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
     ) -> "Lens":
-        """The lens with its clear semi-diameters stored, as a file holds them; automatic ones go on following the rays.
+        """The lens with its clear semi-diameters stored, as a file holds them; automatic ones still follow the rays.
 
         fixed: the surfaces whose semi-diameters no longer follow the rays; all others do, () frees all; None: as they
         are. margin: per cent and mm added to automatic ones, but for the stop and the image; None: as it is. Semi-
@@ -567,6 +567,12 @@ class Lens:
         from raytrace.tracing.geometry import with_semi_diameters
 
         return with_semi_diameters(self, fixed=fixed, margin=margin)
+
+    def with_missing_semi_diameters(self) -> "Lens":
+        """The lens with an automatic semi-diameter, by the rays, at each surface that stores none: as files have it."""
+        from raytrace.tracing.geometry import with_missing_semi_diameters
+
+        return with_missing_semi_diameters(self)
 
     def replace(self, surface: int, **numbers: Any) -> "Lens":
         """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
@@ -992,7 +998,7 @@ def _check_environments(lens: Lens) -> None:
 
 
 def _check_kinds(surface: Surface, where: str) -> None:
-    """Refuse an unknown kind of sag or shape of aperture, and sizes that a shape does not have."""
+    """Refuse an unknown kind of sag or shape of aperture, sizes that a shape does not have, and negative sizes."""
     if surface.kind not in KINDS:
         raise ValueError(f"{where}: kind {surface.kind!r}; expected one of {', '.join(KINDS)}")
     kind, count = KINDS[surface.kind], 0 if surface.coefficients is None else len(surface.coefficients)
@@ -1000,6 +1006,9 @@ def _check_kinds(surface: Surface, where: str) -> None:
         names = ", ".join(kind.name_of(entry) for entry in range(kind.most or count))
         expected = kind.least if kind.most == kind.least else f"{kind.least} to {kind.most}"
         raise ValueError(f"{where}: a {kind.name} of {count} coefficients; expected {expected}: {names}")
+    for name in SIZES:
+        if (size := getattr(surface, name)) is not None and not size >= 0:
+            raise ValueError(f"{where}: {name} {size}: expected a length in mm, 0 or more; or None")
     for aperture in surface.apertures:
         if aperture.shape not in SHAPES:
             known = ", ".join(SHAPES)

@@ -167,6 +167,8 @@ class OptimizationData:
     density) as of `Tolerance`; unit: mm in the unit of length of both, in which a file of
     the lens is written.
     semi_diameters: surfaces of fixed semi-diameter; all others follow the rays; semi_diameter_margin: per cent, and mm.
+    shares_mechanical: whether the surfaces of an element and of a cemented group have one mechanical semi-diameter,
+        where it is not fixed; else each has that of its own clear one.
     """
 
     variables: tuple[Vary, ...] = ()
@@ -178,6 +180,7 @@ class OptimizationData:
     semi_diameter_margin: tuple[float, float] = (0.0, 0.0)
     kept: tuple[Solve, ...] = ()
     distributions: tuple[tuple[str, tuple[tuple[float, float], ...]], ...] = ()
+    shares_mechanical: bool = True
 
     @property
     def rules(self) -> tuple[Vary | Solve, ...]:

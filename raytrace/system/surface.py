@@ -47,6 +47,9 @@ class Surface:
     environment: temperature and pressure of the medium behind the surface, where they are not the lens's.
     expansion: linear expansion, 1e-6/K, of the spacer of the space behind the surface, or of a medium there whose
         catalog lists none; None: none is stated, and the spacer keeps its length.
+    chip_zone: mm by which the polished surface exceeds its clear semi-diameter; None: 0.
+    mechanical_semi_diameter: mm, fixed, of the part; from the chip zone to there it is flat. None: it is the largest
+        clear semi-diameter with its chip zone of the element, or of the cemented group (`tracing.geometry`).
     """
 
     thickness: Tensor
@@ -65,6 +68,8 @@ class Surface:
     comment: str = ""
     environment: Environment | None = None
     expansion: Tensor | None = None
+    chip_zone: float | None = None
+    mechanical_semi_diameter: float | None = None
 
     @property
     def radius(self) -> Tensor:
@@ -85,6 +90,9 @@ class Surface:
         """True if the surface has neither curvature nor aspheric terms nor sag terms to model."""
         return self.curvature is None and self.coefficients is None and self.sag_terms is None
 
+
+#: The fields of a surface that are sizes in mm: plain numbers, by which no ray is clipped.
+SIZES = ("semi_diameter", "chip_zone", "mechanical_semi_diameter")
 
 #: The fields of a surface that make its shape.
 SHAPE = ("curvature", "conic", "coefficients", "kind", "sag_terms")

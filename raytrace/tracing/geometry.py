@@ -3,10 +3,11 @@
 A surface whose conic closes before its semi-diameter h, |c| h √(1+k) ≥ 1; a negative gap, or surfaces that cross,
 between two surfaces that refract, reflect or diffract, along the light; glass whose edge thickness is negative.
 
-The edge of glass is at the rim that both of its faces reach, the larger of their clear heights; that of air is at the
-smaller of the rims of the two elements (`rims`). There the thickness is t + z′ - z (`edge_thickness`), for checks,
-boundaries of merit functions and training. OpticStudio takes z and z′ each at the clear height of its own surface, and
-both at that of the first one in a solve: operands and solves of files give these heights.
+The edge of glass is at the rim that both of its faces reach, the larger of their clear heights with their chip zones;
+that of air is at the smaller of the rims of the two elements (`rims`). There the thickness is t + z′ - z
+(`edge_thickness`), for checks, boundaries of merit functions and training. OpticStudio takes z and z′ each at the clear
+height of its own surface, and both at that of the first one in a solve: operands and solves of files do so.
+Flats between the chip zone and the mechanical semi-diameter change no edge.
 
 Frames: position and rotation of every surface in the axes that rays start in.
 """
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import Number, detached, dot_2, safe_sqrt, value
+from raytrace.system import elements
 from raytrace.system.lens import Lens, media, per_lens
 from raytrace.system.optimization_data import OptimizationData, Solve
 from raytrace.system.poses import Pose, direction_out, point_out
@@ -64,7 +66,7 @@ class Defect:
 def defects(lens: Lens) -> tuple[Defect, ...]:
     """Everything of a lens, in its configuration, that cannot be made."""
     lens = detached(lens)
-    heights, result = semi_diameters(lens), []
+    heights, result = polished_semi_diameters(lens), []
     for k, (surface, height) in enumerate(zip(lens.surfaces, heights, strict=True)):
         edge = math.inf if k == 0 or surface.is_break else _edge_radius(surface)
         if math.isfinite(edge) and height >= edge:
@@ -129,6 +131,20 @@ def semi_diameters(lens: Lens) -> list[float]:
     return [fixed.get(k, automatic.get(k, math.nan)) for k in range(len(lens.surfaces))]
 
 
+def polished_semi_diameters(lens: Lens, clear: Sequence[float] | None = None) -> list[float]:
+    """mm of every surface, up to which it follows its sag: `semi_diameters`, or those given, and the chip zones."""
+    return elements.polished_semi_diameters(lens, semi_diameters(lens) if clear is None else clear)
+
+
+def mechanical_semi_diameters(lens: Lens, clear: Sequence[float] | None = None) -> list[float]:
+    """mm of the part at every surface, as a lens is printed, drawn and written; nan: unknown.
+
+    Fixed ones as stored; the others are the largest of `polished_semi_diameters` and fixed ones of the element, or of
+    the cemented group, as in OpticStudio. clear: `semi_diameters`, where they are known.
+    """
+    return elements.mechanical_semi_diameters(lens, semi_diameters(lens) if clear is None else clear)
+
+
 def _is_of_all_configurations(lens: Lens, k: int) -> bool:
     """Whether an automatic semi-diameter is the largest of all configurations: by its rule, or as none is stored."""
     data = lens.optimization_data
@@ -153,8 +169,22 @@ def with_semi_diameters(
         data = dataclasses.replace(data, semi_diameters=given)
     if fixed is not None or margin is not None:
         lens = dataclasses.replace(lens, optimization_data=data)
-    if lens.count is not None:
+    return lens if lens.count is not None else _stored(lens, data, fixed)
+
+
+def with_missing_semi_diameters(lens: Lens) -> Lens:
+    """The lens with a semi-diameter of the rays, automatic, at every surface that stores none; as a file has it."""
+    missing = [k for k, surface in enumerate(lens.surfaces) if k and not surface.is_break and not surface.semi_diameter]
+    if lens.count is not None or not missing:
         return lens
+    data = lens.optimization_data or OptimizationData(semi_diameters=tuple(fixed_semi_diameters(lens)))
+    return _stored(lens, data, None, missing)
+
+
+def _stored(
+    lens: Lens, data: OptimizationData, fixed: Sequence[int] | None, numbers: Sequence[int] | None = None
+) -> Lens:
+    """The lens with its clear semi-diameters stored, by default of all surfaces; `fixed`: as there."""
     set_by_others = {
         scaled.path[1] for operand in lens.operands for scaled in operand.paths if scaled.path[-1] == _SIZE
     }
@@ -164,7 +194,8 @@ def with_semi_diameters(
     for k, size in enumerate(semi_diameters(lens)):
         stored = surfaces[k].semi_diameter
         is_given = k in data.semi_diameters or k in set_by_others or surfaces[k].sag_terms is not None
-        if is_given or not size > 0 or (stored and abs(size - stored) < _SAME * stored):
+        is_left = numbers is not None and k not in numbers
+        if is_given or is_left or not size > 0 or (stored and abs(size - stored) < _SAME * stored):
             continue
         surfaces[k] = dataclasses.replace(surfaces[k], semi_diameter=size)
         if lens.operands and not stored:

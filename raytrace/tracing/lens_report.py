@@ -20,7 +20,13 @@ from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, vertex_curvature
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
-from raytrace.tracing.geometry import defects, fixed_semi_diameters, semi_diameters, warn_of_defects
+from raytrace.tracing.geometry import (
+    defects,
+    fixed_semi_diameters,
+    mechanical_semi_diameters,
+    semi_diameters,
+    warn_of_defects,
+)
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import LINES, first_order
 from raytrace.tracing.trace import aiming_of
@@ -127,7 +133,8 @@ class Info(Result):
 
     COLUMNS = (
         Column("thickness", "mm", ".7g"), Column("glass", form="<"), Column("index", "", ".6f"),
-        Column("semi_diameter", "mm", ".5g", "semi-dia."), Column("note", form="<"),
+        Column("semi_diameter", "mm", ".5g", "semi-dia."),
+        Column("mechanical_semi_diameter", "mm", ".5g", "mech. s.-d."), Column("note", form="<"),
     )  # fmt: skip
 
     lens: Lens
@@ -136,10 +143,13 @@ class Info(Result):
         lens = detached(self.lens)
         surfaces, like = lens.surfaces, lens.wavelengths
         radius, thickness = like.new_tensor([(_radius(s), float(s.thickness)) for s in surfaces]).T
-        size = like.new_tensor(semi_diameters(lens))
+        clear = semi_diameters(lens)
+        sizes = {"semi_diameter": like.new_tensor(clear)}
+        if any(surface.chip_zone or surface.mechanical_semi_diameter for surface in surfaces):
+            sizes["mechanical_semi_diameter"] = like.new_tensor(mechanical_semi_diameters(lens, clear))
         surface, index = torch.arange(len(surfaces)), like.new_tensor(_indices(lens))
         shape = {"surface": surface, "radius": radius, "thickness": thickness, "glass": surface, "index": index}
-        return shape | {"semi_diameter": size, "note": surface}
+        return {**shape, **sizes, "note": surface}
 
     def words(self) -> dict[str, Sequence[str]]:
         lens = detached(self.lens)
@@ -150,6 +160,7 @@ class Info(Result):
         lens = detached(self.lens)
         indices, geometry = media(lens, lens.wavelengths), [defect.document() for defect in defects(lens)]
         sizes, fixed = semi_diameters(lens), fixed_semi_diameters(lens)
+        widths = mechanical_semi_diameters(lens, sizes)
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
@@ -182,6 +193,9 @@ class Info(Result):
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
                     "semi_diameter": number(sizes[k]),
                     "semi_diameter_is_fixed": k in fixed,
+                    "chip_zone": surface.chip_zone or 0.0,
+                    "mechanical_semi_diameter": number(widths[k]),
+                    "mechanical_semi_diameter_is_fixed": surface.mechanical_semi_diameter is not None,
                     "comment": surface.comment,
                     **_environment(surface),
                     **({} if surface.expansion is None else {"expansion": number(surface.expansion)}),

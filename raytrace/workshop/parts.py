@@ -2,13 +2,14 @@
 
 A profile is a closed line in the half plane (z, r) of a part, of mm from the vertex of its first surface in the
 direction of the light. Spheres, planes and cones are exact; other sags become B-splines, whose deviation is known.
-A face follows its sag up to its clear semi-diameter; beyond, a convex conic and a cemented face follow it to the edge
-of the part, other faces are flat.
+A face follows its sag up to its clear semi-diameter and chip zone; beyond, a convex conic and a cemented face follow it
+to the edge of the part, other faces are flat, as all faces in air of a part of fixed mechanical semi-diameter are.
 """
 
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,12 @@ from raytrace.system.apertures import Aperture, reach
 from raytrace.system.elements import cemented_groups, lens_elements
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, is_round
-from raytrace.tracing.geometry import edge_radius, rims, semi_diameters
+from raytrace.tracing.geometry import (
+    edge_radius,
+    mechanical_semi_diameters,
+    polished_semi_diameters,
+    semi_diameters,
+)
 from raytrace.words import RaytraceError, option
 
 #: Largest deviation in mm of the B-spline of a sag: 1 nm.
@@ -196,13 +202,14 @@ def _along(face: Face, hole: float, rim: float, chamfer: float, sign: int) -> li
 def parts_of(lens: Lens, *, margin: float = 0.0, chamfer: float = 0.0, substrate: float | None = None) -> list[Part]:
     """The elements and mirrors of a lens.
 
-    margin: mm by which the mechanical semi-diameter exceeds the larger clear one; chamfer: mm of both legs; substrate:
-    thickness in mm of mirrors, by default a sixth of their diameter. Raises NoSolid for margins and chamfers that do
-    not fit.
+    Their diameters are those of `mechanical_semi_diameters`. margin: mm added to each that is not fixed on a surface of
+    the element or its cemented group; chamfer: mm of both legs; substrate: thickness in mm of mirrors, by default a
+    sixth of their diameter. Raises NoSolid for margins and chamfers that do not fit.
     """
     lens = detached(lens)
     clear, elements, direction = semi_diameters(lens), lens_elements(lens), sides(lens)
     groups = cemented_groups(lens)
+    polished, widths = polished_semi_diameters(lens, clear), mechanical_semi_diameters(lens, clear)
     result = []
     for number, (first, last) in enumerate(elements, 1):
         name, side = str(number), direction[first]
@@ -212,12 +219,21 @@ def parts_of(lens: Lens, *, margin: float = 0.0, chamfer: float = 0.0, substrate
             glass = lens.surfaces[first].glass
             result.append(Part(name, (first, last), (), glass, math.nan, math.nan, objection=objection))
         elif first == last:
-            result.append(_mirror(lens, name, first, side, clear[first], margin, substrate))
+            more = 0.0 if lens.surfaces[first].mechanical_semi_diameter else margin
+            result.append(_mirror(lens, name, first, side, clear[first], widths[first] + more, substrate))
         else:
-            sizes = np.array([clear[first], clear[back]])
-            rim = float(rims(sizes, np.array([1, 1]), np.array([True, False]))[0]) + margin
+            whole = next(((a, b) for a, b in groups if a <= first and back <= b), (first, back))
+            is_fixed = any(surface.mechanical_semi_diameter for surface in lens.surfaces[whole[0] : whole[1] + 1])
+            rim = max(widths[first], widths[back]) + (0.0 if is_fixed else margin)
+            for k in (first, back):
+                if rim < clear[k]:
+                    raise NoSolid(
+                        f"element {name}: its mechanical semi-diameter of {rim:.6g} mm is smaller than the clear one "
+                        f"of surface {k}, {clear[k]:.6g} mm; expected at least as much"
+                    )
+            sizes = [(clear[k], min(polished[k], rim)) for k in (first, back)]
             cemented = tuple(any(a < k < b for a, b in groups) for k in (first, back))
-            result.append(_element(lens, name, (first, last, back), side, sizes, rim, cemented, chamfer))
+            result.append(_element(lens, name, (first, last, back), side, sizes, rim, is_fixed, cemented, chamfer))
     return result
 
 
@@ -244,25 +260,27 @@ def _element(
     name: str,
     surfaces: tuple[int, int, int],
     side: int,
-    clear: np.ndarray,
+    sizes: Sequence[tuple[float, float]],
     rim: float,
+    is_fixed: bool,
     cemented: tuple[bool, ...],
     chamfer: float,
 ) -> Part:
     first, last, back = surfaces
     thickness = side * float(sum(surface.thickness for surface in lens.surfaces[first:back]))
     faces = [
-        Face(k, lens.surfaces[k], vertex, side, float(size), is_cemented=joined)
-        for k, vertex, size, joined in zip((first, back), (0.0, thickness), clear, cemented, strict=True)
+        Face(k, lens.surfaces[k], vertex, side, size, is_cemented=joined)
+        for k, vertex, (size, _), joined in zip((first, back), (0.0, thickness), sizes, cemented, strict=True)
     ]
     # A convex conic is polished to the edge; a concave face and an asphere end with a flat.
     further = tuple(
-        face.is_cemented or (face.surface.coefficients is None and face.surface.sag_terms is None and convex >= 0)
+        face.is_cemented
+        or (face.surface.coefficients is None and face.surface.sag_terms is None and convex >= 0 and not is_fixed)
         for face, convex in zip(faces, (faces[0].curvature, -faces[1].curvature), strict=True)
     )
     pair = (faces[0].surface, faces[1].surface)
     edges = [0.9999 * edge_radius(surface) for surface in pair]
-    radii = [min(face.clear, edge) for face, edge in zip(faces, edges, strict=True)]
+    radii = [min(polished, edge) for (_, polished), edge in zip(sizes, edges, strict=True)]
     r, part = np.linspace(0, rim, 257), None
     for ends in continuations(pair, radii, rim, (further[0], further[1])):
         reached = (dataclasses.replace(f, reach=min(e, m)) for f, e, m in zip(faces, ends, edges, strict=True))
@@ -276,9 +294,9 @@ def _element(
     )
 
 
-def _mirror(lens: Lens, name: str, k: int, side: int, clear: float, margin: float, substrate: float | None) -> Part:
-    """A mirror on a substrate with a plane rear, whose least thickness is `substrate`."""
-    surface, rim = lens.surfaces[k], min(clear + margin, 0.9999 * edge_radius(lens.surfaces[k]))
+def _mirror(lens: Lens, name: str, k: int, side: int, clear: float, width: float, substrate: float | None) -> Part:
+    """A mirror on a substrate with a plane rear, whose least thickness is `substrate`; width: its rim, mm."""
+    surface, rim = lens.surfaces[k], min(width, 0.9999 * edge_radius(lens.surfaces[k]))
     thickness = 2 * rim / 6 if substrate is None else substrate
     front = Face(k, surface, 0.0, side, clear, reach=rim)
     rise = max(0.0, float(front.z(np.array([rim]))[0]))

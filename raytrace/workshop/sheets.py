@@ -137,10 +137,15 @@ class Drawings(Result):
             content = _pages(self.sheets())
             write_atomically(path, lambda file: file.write(content))
         else:
-            papers = self.sheets()
-            for k, paper in enumerate(papers, 1):
-                name = Path(path).with_name(f"{Path(path).stem}_{k}{suffix}") if len(papers) > 1 else path
+            for paper, name in zip(self.sheets(), self.files(path), strict=True):
                 style.save(paper.figure(), name)
+
+    def files(self, path: str | PathLike) -> list[Path]:
+        """The files that `save` writes: of several sheets as .svg or .png NAME_1, NAME_2, …"""
+        path, count = Path(path), len(self._contents())
+        if path.suffix.lower() not in (".svg", ".png") or count == 1:
+            return [path]
+        return [path.with_stem(f"{path.stem}_{k}") for k in range(1, count + 1)]
 
 
 def draw(
@@ -162,9 +167,9 @@ def draw(
     the whole lens; (): all of them and the whole lens; None: the whole lens alone.
     grade, limits: tolerances, as of `tolerances`, by default those of the lens. indications: further ones of all parts,
     "0/20 1/3x0.16 2/1;1 5/5x0.25 6/-"; coating: of all surfaces in air. What is not specified is a dash.
-    margin: mm by which the mechanical semi-diameter of an element exceeds the larger of its clear ones; chamfer: mm of
-    both legs, at 45°; substrate: thickness in mm of mirrors, by default a sixth of their diameter; date: of the title
-    block. `save` writes .pdf, .svg, .png, .dxf or .step. Raises ValueError, NoSolid, BadTolerance, BadIndication.
+    margin: mm added to mechanical semi-diameters that are not fixed; chamfer: mm of both legs, at 45°; substrate:
+    thickness in mm of mirrors, by default a sixth of their diameter; date: of the title block. `save` writes .pdf,
+    .svg, .png, .dxf or .step. Raises ValueError, NoSolid, BadTolerance, BadIndication.
     """
     for name, size in (("margin", margin), ("chamfer", chamfer)):
         if not 0 <= size < math.inf:

@@ -64,6 +64,8 @@ _COMMENT_WORDS = (
     "CATALOGS",
     "CONDITIONS",
     "EXPANSION",
+    "CHIP_ZONE",
+    "MECHANICAL_SEMI_DIAMETER",
     "NOTE",
     "RADIUS",
     "UNNAMED",

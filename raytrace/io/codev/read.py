@@ -80,7 +80,7 @@ from raytrace.system.apertures import Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
 from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose
-from raytrace.system.surface import Surface, medium_surfaces, power, signed, ynu
+from raytrace.system.surface import SIZES, Surface, medium_surfaces, power, signed, ynu
 
 #: Millimetres in a unit of DIM.
 _UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4, "INCH": 25.4}
@@ -359,14 +359,14 @@ def _surface(
     """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
 
     comments: of this package: BREAK makes a coordinate break of a dummy surface, RADIUS is that of its phase, EXPANSION
-    that of its spacer.
+    that of its spacer, CHIP_ZONE and MECHANICAL_SEMI_DIAMETER are sizes of the part.
     """
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
     glass, is_break = _medium(block, before, library, report), "BREAK" in comments
-    radius, expansion = (
+    radius, expansion, chip_zone, width = (
         number((stated.text or "?").strip(), word.lower(), stated.place) if (stated := comments.get(word)) else None
-        for word in ("RADIUS", "EXPANSION")
+        for word in ("RADIUS", "EXPANSION", *(name.upper() for name in SIZES[1:]))
     )
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
@@ -385,6 +385,8 @@ def _surface(
         apertures=apertures,
         comment=unquoted(label.words[0]).strip() if label and label.words else "",
         expansion=None if expansion is None else double(expansion),
+        chip_zone=None if chip_zone is None else chip_zone * unit,
+        mechanical_semi_diameter=None if width is None else width * unit,
     )
 
 

@@ -43,7 +43,7 @@ from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose, undone
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import SIZES, Surface
 from raytrace.words import option
 
 #: Digits of a written coefficient of a phase, enough to read back the same number through two roundings.
@@ -195,6 +195,11 @@ def _surface(
         f"  {COMMENT.lower()} expansion {exact(surface.expansion, 'thermal expansion', place)}"
         if surface.expansion is not None
         else "",
+        *(
+            f"  {COMMENT.lower()} {name} {exact(size, name.replace('_', ' '), place)}"
+            for name in SIZES[1:]
+            if (size := getattr(surface, name)) is not None
+        ),
         *_poses(surface, place),
         *_shape(surface, place),
         *([] if radial is None else _phase(radial, float(lens.primary), place)),

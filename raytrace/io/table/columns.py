@@ -14,6 +14,7 @@ from typing import NamedTuple
 from raytrace.io.source import IGNORED, MILLIMETRES, READ, UNKNOWN, Draft, LensFileError, Place, shown
 from raytrace.materials.glass import LINES
 from raytrace.system.shapes import KINDS
+from raytrace.system.surface import SIZES
 
 _SPELLINGS = {
     "label": "surface, surf, srf, s, si, i, j, m, no, nr, num, number, #, id, surface no, surface number, surface #"
@@ -51,6 +52,8 @@ _SPELLINGS = {
     "diameter": "diameter, dia, diam, φ, ø, ca, clear aperture, clear diameter, clear diam, effective diameter, eff dia"
     ", eff diameter, effective dia, free diameter, aperture diameter, 有効径, 口径, 直径, 通光口径, 有效口径"
     ", durchmesser, freier durchmesser, diametre, diametre utile",
+    "chip_zone": "chip zone",
+    "mechanical_semi_diameter": "mechanical semidiameter",
     "stop": "stop, is stop, aperture stop, 絞り, 光阑, blende",
     "apertures": "aperture, apertures",
     "temperature": "temperature",
@@ -62,8 +65,7 @@ _SPELLINGS = {
 _OTHERS = {
     "a focal length follows from the surfaces": "f, fl, efl, focal length, lens focal length, element focal length"
     ", focal length of lens, component focal length, 焦点距離, 焦距, brennweite, focale, distance focale",
-    "a size of the mechanical part": "mech semidia, mechanical semidiameter, mech diam, mech dia, mechanical diameter"
-    ", chip zone, edge thickness, コバ厚",
+    "a size of the mechanical part": "mech semidia, mech diam, mech dia, mechanical diameter, edge thickness, コバ厚",
     "a setting of the program": "ccy, cuc, thc, glc, spe, id no",
     "coatings and heat refract no rays": "coating, cte, specific gravity, density, 比重",
 }
@@ -95,7 +97,7 @@ _UNITS |= {"m": "m", "meter": "m", "meters": "m", "μm": "μm", "um": "μm", "mi
 _UNITS |= {"1/in": "in", "1/cm": "cm", "1/m": "m", "unit:mm": "mm", "unitmm": "mm", "単位mm": "mm", "单位mm": "mm"}
 #: A column of unknown meaning: its cells may be words, but not numbers.
 UNREAD = "?"
-_LENGTHS = ("radius", "thickness", "curvature", "semi_diameter", "diameter", "d", "D")
+_LENGTHS = ("radius", "thickness", "curvature", "diameter", "d", "D", *SIZES)
 
 
 class Heading(NamedTuple):

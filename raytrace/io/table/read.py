@@ -212,6 +212,8 @@ def _surface(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Seq
         kind=kind,
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
+        chip_zone=_size(row, "chip_zone", unit),
+        mechanical_semi_diameter=_size(row, "mechanical_semi_diameter", unit),
         apertures=tuple(
             _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
         ),
@@ -258,6 +260,13 @@ def _semi_diameter(row: Row, unit: float) -> float | None:
     size = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
     if size < 0:
         raise LensFileError(f"semi-diameter is {size:g}, expected 0 or more", row.place)
+    return size * unit or None
+
+
+def _size(row: Row, column: str, unit: float) -> float | None:
+    size = _cell(row, column) or 0.0
+    if size < 0:
+        raise LensFileError(f"{column} is {size:g}, expected 0 or more", row.place)
     return size * unit or None
 
 

@@ -20,6 +20,7 @@ from raytrace.io.source import (
     shown,
 )
 from raytrace.io.table.columns import UNREAD, columns, is_header, order, squeezed
+from raytrace.system.surface import SIZES
 
 #: Header keys, each with its further spellings; a note may occur more than once.
 _KEYS = (
@@ -243,13 +244,13 @@ _COEFFICIENT = re.compile(r"(?:k|κ|ε|[A-Z]\d{0,2}|a\d{1,2})\s*=.*", re.DOTALL)
 _DECIMAL = re.compile(r"[+-]?(?:0?,\d+|\d+,(?:\d{1,2}|\d{4,}))(?:[eE][+-]?\d+)?|[+-]?\d{4,},\d+")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+\.\d*|[+-]?[1-9]\d{0,2}(?:,\d{3}){2,}")
 #: Columns whose numbers may reach thousands.
-_SIZES = ("radius", "thickness", "curvature", "diameter", "conic")
+_MAY_BE_LARGE = ("radius", "thickness", "curvature", "diameter", "conic")
 _EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}(?:[eE][+-]?\d+)?")
 
 
 def is_figure(column: str) -> bool:
     """True for a column of numbers."""
-    numeric = ("radius", "thickness", "curvature", "conic", "semi_diameter", "diameter", "pgf", "dpgf")
+    numeric = ("radius", "thickness", "curvature", "conic", "diameter", "pgf", "dpgf", *SIZES)
     return (
         column in (*numeric, "temperature", "pressure")
         or column.startswith(("index ", "abbe "))
@@ -285,7 +286,7 @@ def _without_commas(row: Row, decimal: bool, point: bool) -> dict[str, str]:
             raise LensFileError(f"{message}; write it in a column of its surface: conic, A4, A6, …", row.place)
         if not is_figure(name) or "," not in cell:
             continue
-        if not name.endswith(_SIZES) and (_DECIMAL.fullmatch(cell) or _EITHER.fullmatch(cell)):
+        if not name.endswith(_MAY_BE_LARGE) and (_DECIMAL.fullmatch(cell) or _EITHER.fullmatch(cell)):
             cells[name] = cell.replace(",", ".")  # an index of 1,516 is no index of 1516
         elif _THOUSANDS.fullmatch(cell) or (_EITHER.fullmatch(cell) and point and not decimal):
             cells[name] = cell.replace(",", "")

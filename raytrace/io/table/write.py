@@ -13,7 +13,7 @@ from raytrace.materials.glass import Glass, mil_glass
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import SIZES, Surface
 
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = (), separator: str = ",") -> bytes:
@@ -37,7 +37,16 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
     """The columns of the table by heading; columns that would be empty are left out."""
     listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
     powers = sorted({n for row in listed for name in row if (n := order(name)) is not None})
-    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", *ENVIRONMENT, "expansion", "comment"]
+    names = [
+        "conic",
+        "semi_diameter",
+        *(f"a{n}" for n in powers),
+        "apertures",
+        *SIZES[1:],
+        *ENVIRONMENT,
+        "expansion",
+        "comment",
+    ]
     used = [name for name in names if any(name in row for row in listed)]
     always = ["surface", "type", "curvature", "thickness", "glass"]
     return {name: [row.get(name, "") for row in listed] for name in always + used}
@@ -57,8 +66,8 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
     }
     if surface.conic is not None:
         row["conic"] = exact(surface.conic, "conic constant", place)
-    if surface.semi_diameter is not None:
-        row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
+    sizes = {name: size for name in SIZES if (size := getattr(surface, name)) is not None}
+    row |= {name: exact(size, name.replace("_", " "), place) for name, size in sizes.items()}
     if kind is not None and surface.coefficients is not None:
         terms = exact_list(surface.coefficients, "aspheric terms", place)
         row |= {f"a{kind.step * j}": term for j, term in enumerate(terms, 1)}

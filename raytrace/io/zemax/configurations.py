@@ -99,7 +99,7 @@ _LEFT_OUT = by_word(
         "polarisation": "GPEX GPEY GPIU GPJX GPJY GPPX GPPY GQPO",
         "setting of the computation, independent of the lens": "MTFU OPDR CPCN PXAR SWCN AICN HOLD SDRW",
         "shift of the pupil for the program's own ray aiming": "PSHX PSHY PSHZ PSCX PSCY PUCN",
-        "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MCHI",
+        "size of the part: for drawing and mounting, never clips a ray": "MCHI",
     }
 )
 

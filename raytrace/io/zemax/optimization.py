@@ -8,6 +8,9 @@ The solves of a surface are stored with its numbers, which are the solved ones:
     PPAR n surface factor offset    parameter n is a pickup
     GLAS name code surface nd Vd ΔPgF v v v    code 2: a pickup, 3: may be substituted; v 1: variable, of a model glass
     DIAM value code         0: automatic, 1: fixed, 2: a pickup, 3: the largest of all configurations
+    MEMA value code         0: automatic, 1: fixed, 2: a pickup; mechanical semi-diameter
+    OEMA value code         2: a pickup; chip zone
+    OMMA 1 1                automatic MEMA are those of the cemented group; 0 0: each is of its own surface
 
 CURV 2, 4, 8, 11, MAZH (paraxial, and by a real ray), PZUP, TOLE and EDGE reproduce the numbers that OpticStudio stored.
 Codes that are not followed are kept with their numbers. A number of a configuration has a status, 1 variable or 2
@@ -47,6 +50,7 @@ from raytrace.io.source import (
 from raytrace.io.zemax.surfaces import (
     BLANK,
     INVERSE,
+    MECHANICAL,
     SYSTEM_IGNORED,
     TAIL_REASON,
     TOLERANCES,
@@ -69,7 +73,7 @@ from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.parameter_paths import BadVariables, parameter_paths, parse_bounds
-from raytrace.system.surface import Surface
+from raytrace.system.surface import SIZES, Surface
 
 
 class SolveRow(NamedTuple):
@@ -106,8 +110,12 @@ THICKNESS_SOLVES = {
 }
 _FOLLOWED = ("pickup", *(r.kind for r in (*CURVATURE_SOLVES.values(), *THICKNESS_SOLVES.values()) if r.followed))
 
-#: Rules by the code of DIAM, and by the code of GLAS.
-_FIXED, _SEMI_DIAMETER_RULES = 1, {2: "pickup", 3: "maximum"}
+#: Keyword and rules by its code of each size of a surface, and rules by the code of GLAS.
+_FIXED = 1
+_SIZE_RULES = {
+    "semi_diameter": ("DIAM", {2: "pickup", 3: "maximum"}),
+    **{size: (keyword, {2: "pickup"}) for size, keyword in MECHANICAL.items()},
+}
 _MODEL, _GLASS_RULES = 1, {2: "pickup", 3: "substitute"}
 
 #: Status of a number of a configuration: 1 is a variable.
@@ -196,8 +204,9 @@ def _rules(typed: TypedSurface, surfaces: Sequence[TypedSurface], report: Draft)
                 yield Vary(typed.number, name)
     elif code:
         yield typed.coded("glass", "GLAS", _GLASS_RULES)
-    if typed.code("DIAM") not in (0, _FIXED):
-        yield typed.coded("semi_diameter", "DIAM", _SEMI_DIAMETER_RULES)
+    for size, (keyword, kinds) in _SIZE_RULES.items():
+        if typed.code(keyword) not in (0, _FIXED):
+            yield typed.coded(size, keyword, kinds)
 
 
 def _solve_numbers(record: Record | None, first: int) -> list[float]:
@@ -381,6 +390,7 @@ def read(
     percent, length = (
         measured(margin, k, "margin of semi-diameters", millimetres, 0.0) if margin else 0.0 for k in (0, 2)
     )
+    shared = sections.system.last("OMMA")
     data = OptimizationData(
         variables,
         tuple(solve for solve in solves if _is_followed(solve, lens)),
@@ -393,6 +403,7 @@ def read(
         ),
         semi_diameter_margin=(percent, length),
         kept=kept,
+        shares_mechanical=shared is None or any(shared.integer(k, "sizes of parts", 1) for k in range(2)),
     )
     sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
     lens = _with_variables_modelled(lens, surfaces, data)
@@ -403,7 +414,7 @@ def _is_followed(solve: Solve, lens: Lens) -> bool:
     if solve.kind == "thermal":
         return lens.environment is not None and bool(re.fullmatch(r"thickness|curvature|a\d+", solve.quantity))
     if solve.operand is None:
-        return solve.quantity != "semi_diameter" and solve.kind in _FOLLOWED
+        return solve.quantity not in SIZES and solve.kind in _FOLLOWED
     # a pickup between configurations: of a quantity whose unit is known, or that needs none
     is_linear = solve.quantity in ("thickness", "curvature", "conic") or (not solve.offset and solve.quantity.islower())
     return solve.kind == "pickup" and bool(solve.numbers) and is_linear
@@ -545,10 +556,11 @@ def tail_lines(data: OptimizationData | None, place: Place) -> list[str]:
 Lines = list[str]
 
 
-def margin_line(data: OptimizationData | None) -> str:
-    """The line of SDMA."""
-    percent, length = (0.0, 0.0) if data is None else data.semi_diameter_margin
-    return f"SDMA {_spelled(percent)} 1 {_spelled(length)}"
+def size_lines(data: OptimizationData | None) -> Lines:
+    """The lines of SDMA and OMMA."""
+    data = OptimizationData() if data is None else data
+    percent, length = data.semi_diameter_margin
+    return [f"SDMA {_spelled(percent)} 1 {_spelled(length)}", f"OMMA {'1 1' if data.shares_mechanical else '0 0'}"]
 
 
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
@@ -562,13 +574,13 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
         rule for rule in rules if rule.operand is not None or isinstance(rule, Solve) or rule.quantity not in picked
     ]
     rules += [rule for rule in pickups if rule.quantity not in solved]
-    if lens.optimization_data is not None:
-        sizes = [rule for rule in rules if rule.quantity == "semi_diameter" and isinstance(rule, Solve)]
-        code, source = (_FIXED if number in data.semi_diameters else 0), 0
-        if not code and sizes:
-            code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
-        lines = changed(lines, "DIAM", {2: str(code), 3: str(source)})
-    rules = [rule for rule in rules if rule.operand is None and rule.quantity != "semi_diameter"]
+    fixed = number in data.semi_diameters
+    lines = lines if lens.optimization_data is None else changed(lines, "DIAM", {2: str(_FIXED if fixed else 0)})
+    for rule in rules:
+        if isinstance(rule, Solve) and rule.quantity in SIZES and not (fixed and rule.quantity == "semi_diameter"):
+            keyword, kinds = _SIZE_RULES[rule.quantity]
+            lines = changed(lines, keyword, {2: str(_code_of(rule.kind, kinds)), 3: str(rule.source)})
+    rules = [rule for rule in rules if rule.operand is None and rule.quantity not in SIZES]
     row, surface = types().get(type_of(lens.surfaces[number]) or ""), lens.surfaces[number]
     parameters: dict[str, tuple[str, int, Surface]] = {}
     if rules and row is not None:

@@ -60,14 +60,14 @@ from raytrace.system.surface import Surface
 SYSTEM_READ = by_word(
     {
         "read": "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD"
-        " YFLD FWGT FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT"
-        " WWGN"
+        " YFLD FWGT FEFD SDMA OMMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN"
+        " WWGT WWGN"
     }
 )
 _SURFACE_READ = by_word(
     {
         "read": "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR"
-        " PPAR PZUP MAZH TOLE EDGE TCED"
+        " PPAR PZUP MAZH TOLE EDGE TCED MEMA OEMA"
     }
 )
 
@@ -79,7 +79,6 @@ _REPEATED = ("NOTE", "WAVM", "FEFD", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SC
 SYSTEM_IGNORED = by_word(
     {
         "setting of the program, independent of the lens": "PFIL LANG HYPR ROPD PICB EERA LUID IWDP STUD FSVY",
-        "how mechanical semi-diameters are recomputed": "OMMA",
         "shift of the pupil for the program's own ray aiming": "PUSH",
         "global coordinate reference: changes no ray": "GLRS",
         "default tolerances and glass substitution": "GSTD",
@@ -100,8 +99,6 @@ SURFACE_IGNORED = by_word(
         "substrate of a mirror, for drawing": "MIRR",
         "label for the program's macros": "SLAB SSID",
         "sampling of wave propagation": "POPS",
-        "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MEMA",
-        "edge of the mechanical part": "OEMA",
         "coatings refract no rays": "COAT",
     }
 )
@@ -398,10 +395,14 @@ ROWS = {
     "LTTL": ValueRow("", "NAME", 1, "name", kind=TEXT),
 }
 
+#: The keywords of sizes of the part, by the field of a surface.
+MECHANICAL = {"chip_zone": "OEMA", "mechanical_semi_diameter": "MEMA"}
+
 
 def _powers() -> dict[str, dict[int, int]]:
     """The powers of length of the rows, and those of words without an operand."""
     powers: dict[str, dict[int, int]] = {"SDMA": {3: 1}, "VDSZ": {1: 1, 2: 1}, "PZUP": {3: 1}, "UDAD": {2: 1, 3: 1}}
+    powers |= {keyword: {1: 1} for keyword in MECHANICAL.values()}
     for row in ROWS.values():
         if row.power and row.argument != "field":
             powers.setdefault(row.keyword, {})[row.word] = row.power
@@ -1043,6 +1044,10 @@ def build(
     return Surface(
         thickness=double(distance),
         semi_diameter=numbers.size,
+        chip_zone=_part_size(block, "OEMA", millimetres),
+        mechanical_semi_diameter=_part_size(block, "MEMA", millimetres)
+        if block.integer("MEMA", "code", 0, 1)
+        else None,
         comment=comment.text.strip() if comment else "",
         expansion=double(ROWS["TCEX"].read(stated)) if stated else None,
         **fields,
@@ -1064,6 +1069,15 @@ def semi_diameter(block: Block, millimetres: float) -> float | None:
     size = ROWS["SDIA"].read(record, millimetres) if record and record.words else 0.0
     if record and size < 0:
         raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
+    return size or None
+
+
+def _part_size(block: Block, keyword: str, millimetres: float) -> float | None:
+    """A size of the part in mm; None where it is absent or 0."""
+    record = block.last(keyword)
+    size = measured(record, 0, "size of the part", millimetres) if record and record.words else 0.0
+    if record and size < 0:
+        raise LensFileError(f"{keyword} is {shown(record.words[0])}, expected a length of 0 or more", record.place)
     return size or None
 
 

@@ -36,7 +36,7 @@ from raytrace.io.zemax.configurations import (
 from raytrace.io.zemax.optimization import (
     CURVATURE_SOLVES,
     THICKNESS_SOLVES,
-    margin_line,
+    size_lines,
     statuses,
     tail_lines,
     with_rules,
@@ -69,6 +69,7 @@ from raytrace.io.zemax.written_form import in_file_terms
 from raytrace.materials.glass import Glass, abbe_number, mil_glass, nd
 from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.configurations import Operand, count, same, with_operands
+from raytrace.system.elements import mechanical_semi_diameters
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed
@@ -94,9 +95,10 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     """The system and the surfaces."""
     lines = _system(lens, Place(file), catalogs)
+    widths = mechanical_semi_diameters(lens, [_stored_size(lens, k) or 0.0 for k in range(len(lens.surfaces))])
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        lines += with_rules(_surface(lens, number, surface, place), lens, number, place)
+        lines += with_rules(_surface(lens, number, surface, widths[number], place), lens, number, place)
     return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
@@ -138,7 +140,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
         *([] if aiming == "auto" else [f"RAIM 0 {AIMINGS.index(aiming)} 1 1 0 0 0 0 0"]),
         "PUSH 0 0 0 0 0 0",
-        margin_line(lens.optimization_data),
+        *size_lines(lens.optimization_data),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 {int(lens.afocal)}",
         "ROPD 2",
         "PICB 1",
@@ -169,11 +171,15 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
 # -- a surface --------------------------------------------------------------------------------------------------------
 
 
-def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
+def _stored_size(lens: Lens, number: int) -> float | None:
+    """The semi-diameter of a surface as stored, mm, or that of the stop by which the aperture floats."""
+    floats = number == lens.stop and lens.aperture.kind == "float_by_stop"
+    return float(lens.aperture.value) if floats else lens.surfaces[number].semi_diameter
+
+
+def _surface(lens: Lens, number: int, surface: Surface, width: float, place: Place) -> list[str]:
     kind = _type(surface, place)
-    semi_diameter = surface.semi_diameter
-    if number == lens.stop and lens.aperture.kind == "float_by_stop":
-        semi_diameter = float(lens.aperture.value)
+    semi_diameter, fixed = _stored_size(lens, number), surface.mechanical_semi_diameter is not None
     size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, ROWS['SDIA'].quantity, place)} 1"
     # an aperture that follows the semi-diameter from one configuration to the next
     followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
@@ -191,6 +197,8 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         *([] if surface.expansion is None else [f"  TCED {ROWS['TCEX'].write(surface, place)} 0 0"]),
         *([] if surface.conic is None else [f"  CONI {ROWS['CONN'].write(surface, place)}"]),
         f'  DIAM {size} 0 0 1 ""',
+        *([] if not surface.chip_zone else [f'  OEMA {exact(surface.chip_zone, "chip zone", place)} 0 0 0 1 ""']),
+        f'  MEMA {exact(width, "mechanical semi-diameter", place)} {int(fixed)} 0 0 1 ""',
         *_apertures(surface.apertures, place, ("surfaces", number, "apertures") in followed),
         *([f"  COMM {comment}"] if comment else []),
     ]

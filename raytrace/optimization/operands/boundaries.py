@@ -129,6 +129,8 @@ class Gaps:
         self.end = np.array(
             [next((k for k in range(j + 1, last) if not surfaces[k].is_break), last) for j in range(last + 1)]
         )
+        #: mm (S,) by which faces are polished beyond their semi-diameters.
+        self.chip_zones = np.array([surface.chip_zone or 0.0 for surface in surfaces])
         self.terms = [name for name in view.of_surfaces if name[0] == "a"]
         self.others = [k for k, surface in enumerate(surfaces) if not (surface.is_break or _is_even(surface))]
 
@@ -160,7 +162,7 @@ class Gaps:
         if code < RIM:
             sags_there = self._sag(context, code, every, sizes)
             return sags_there, sags_there[self.end]
-        rim = rims(sizes, self.end, ~self.is_air & (self.end > every))
+        rim = rims(sizes + self.chip_zones, self.end, ~self.is_air & (self.end > every))
         if code >= 2 * RIM:
             rim, code = rim * ((code - 2 * RIM + 1) / ZONES), RIM
         front, back = (self._sag(context, code - RIM, surfaces, rim) for surfaces in (every, self.end))
