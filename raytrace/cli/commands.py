@@ -388,9 +388,12 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
         tessar --merit spot --vary curvature sensor glass --hold efl=100 --glasses preferred 'price<=2' -o cheap.zmx
         double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
+        warm.zmx --merit spot --vary curvature sensor spacer --mounts aluminium titanium invar peek -o athermal.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses", AS_BUILT,
+        *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses",
+        Option("mounts", None, "MATERIAL", "materials for spacer and barrel in --vary, as aluminium stainless-304, or "
+            "1e-6/K (default: all listed materials)", nargs="+"), AS_BUILT,
         group(
             "stopping",
             Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
