@@ -66,7 +66,8 @@ class CodesignSettings(Settings):
     sensor: width and height; () for a grey camera of field points. Pictures of a sensor have the channels of its
     response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
     `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
-    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; step: unit of the
+    model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; no_hold: without
+    the conditions of the lens; step: unit of the
     variables, "sag" or "blur"; optimizer: of the lens, "lm", steps of second order to the optimum of the closed form,
     behind which the network is trained, or "adam", together with the network; turns: of the lens, by steps of second
     order for the loss of a network that adapts to it, and of the network again, as many epochs; relearn: epochs of step
@@ -91,6 +92,7 @@ class CodesignSettings(Settings):
     air_thickness: str = ""
     edge: float | None = None
     hold: str = ""
+    no_hold: bool = False
     step: Literal["sag", "blur"] = "sag"
     optimizer: Literal["adam", "lm"] = "lm"
     turns: int = 0

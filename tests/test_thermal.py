@@ -153,3 +153,21 @@ def test_optimisation_over_temperatures_lowers_the_spots_of_all():
     assert max(after) < 0.8 * max(before)
     start = dataclasses.replace(found.lens.configuration(1), operands=())
     assert numbers(found.lens.configuration(3)) == pytest.approx(np.array(numbers(start.at(temperature=60))), rel=1e-12)
+
+
+def test_only_what_is_asked_is_computed(shown, tmp_path):
+    """The numbers that are asked are those of the whole analysis."""
+    for measure in ("focus", ["rms"]):
+        some = rt.thermal(simple(), [-20, 60], samples=3, measure=measure)
+        assert some.modulation is None
+        torch.testing.assert_close(some.focus_shift, shown.focus_shift, rtol=0, atol=1e-12)
+        assert (some.rms is None) == (measure == "focus")
+        assert list(some.columns()) == list(shown.columns())[: 7 if some.rms is not None else 5]
+        some.plot(tmp_path / "some.png")
+    torch.testing.assert_close(some.rms, shown.rms, rtol=0, atol=1e-12)
+    assert "frequency" not in some.document()
+    contrast = rt.thermal(simple(), [-20, 60], samples=3, measure="mtf", modulation_frequency=20)
+    assert contrast.rms is None
+    torch.testing.assert_close(contrast.modulation, shown.modulation, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"`measure` 'spots': expected focus, rms, mtf"):
+        rt.thermal(simple(), measure="spots")

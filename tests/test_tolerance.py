@@ -214,7 +214,7 @@ def test_tolerances_of_a_file(file):
 @pytest.mark.slow
 def test_no_error_alone_does_more_than_the_increment(triplet):
     free = rt.tolerance(triplet, limits=LIMITS, trials=0)
-    held = rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.1)
+    held = rt.tolerance(triplet, limits=LIMITS, trials=0, increment=0.1, workshop="any")
     before, after = (torch.cat([found.minimum, found.maximum]) for found in (free, held))
     assert int((before > 0.1).sum()) > 5
     assert torch.allclose(after, before.clamp(max=0.1), atol=1e-6)
@@ -227,7 +227,7 @@ def test_no_error_alone_does_more_than_the_increment(triplet):
 @pytest.mark.slow
 def test_limits_of_a_yield_have_it_at_less_tightness_than_a_common_factor(triplet, built):
     goal, free = float(built.percentile(60)), built
-    found = rt.tolerance(triplet, limits=LIMITS, trials=1500, goal=goal, yield_=0.9)
+    found = rt.tolerance(triplet, limits=LIMITS, trials=1500, goal=goal, yield_=0.9, workshop="any")
     assert found.summary()["yield_by_second_order"] == pytest.approx(0.9, abs=0.01)
     assert found.yield_at(goal) == pytest.approx(0.9, abs=0.03)  # 4 σ of the binomial distribution
     factors = found.tolerances.maximum / free.tolerances.maximum

@@ -801,9 +801,9 @@ def test_a_group_is_at_its_limits_at_once_and_a_line_of_the_table(tmp_path):
     assert sorted(built.worst.tolist()) == [0, 3]
     text = str(built)
     assert "zernike 4 … zernike 6 of surface 5" in text
-    assert "surface_decenter_x … surface_decenter_y of surface 4" in text
+    assert "surface_decenter_radial of surface 4" in text
     assert "made.zmx:48: ISOB: figure by ISO 10110-5" in text.splitlines()[-1]
-    tight = rt.tolerance(lens, found, trials=0, increment=1e-3)
+    tight = rt.tolerance(lens, found, trials=0, increment=1e-3, workshop="any")
     assert max(tight.minimum.max(), tight.maximum.max()) < 1.001e-3
     assert len({round(row.maximum, 12) for row in tight.tolerances[:3]}) == 1
 

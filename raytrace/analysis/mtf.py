@@ -225,6 +225,13 @@ def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, choice: Tensor | None,
     return Mtf(lens, fields, frequencies, tangential, sagittal, limit, whole, by_rays, marked)
 
 
+def modulations(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangential and sagittal MTF (F, K) of fields (2, F), as `mtf` has them, without the limit of diffraction."""
+    rows = [_of_field(lens, field, None, frequencies)[:2] for field in fields.split(1, 1)]
+    tangential, sagittal = (torch.cat(parts) for parts in zip(*rows, strict=True))
+    return tangential, sagittal
+
+
 def geometric_mtf(lens: Lens, fields: Tensor, frequencies: Tensor, *, marked: bool = False) -> Mtf:
     """The MTF of rays of fields (2, F), which have to reach the sensor. Raises EmptySpot, TooManyPoints."""
     by_rays = torch.ones_like(fields[0], dtype=torch.bool)

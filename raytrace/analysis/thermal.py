@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from raytrace.analysis.mtf import frequency_range, mtf
+from raytrace.analysis.mtf import frequency_range, modulations
 from raytrace.analysis.panels import ruled
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, Points, like, setting, wavelength_shares
@@ -17,12 +17,14 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
 from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, fill, new_figure, number_text, styled
-from raytrace.system.lens import Lens, temperature_of, with_sensor_distance
+from raytrace.system.lens import Lens, aligned, temperature_of, with_sensor_distance
 from raytrace.tracing.focus import focus_of_rms, mean_rms_radius
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import option
 
 _RINGS = SAMPLINGS["gauss"][2]
+#: What `thermal` computes over temperature.
+MEASURES = ("focus", "rms", "mtf")
 _LARGER = {"fixed": INK, "refocused": "#0072B2"}
 
 
@@ -33,7 +35,7 @@ class Thermal(Analysis):
     focus_shift: (T,) mm of the best focus of all fields from the sensor, along the light, less that at the temperature
         of the lens; the sensor is fixed in the mount, which expands.
     rms: (2, T) mm, RMS spot radius of all fields and wavelengths, the sensor fixed and refocused; modulation: (2, T),
-        the lowest of all fields, tangential and sagittal, at `frequency` () cycles/mm.
+        the lowest of all fields, tangential and sagittal, at `frequency` () cycles/mm. None where they are not asked.
     depth_of_focus: () mm, ±λ/(2 n sin²θ) of the primary wavelength; expansion: () 1e-6/K, of the mount.
     fields: (2, F); lens: at its own temperature, with its mount.
     """
@@ -45,9 +47,9 @@ class Thermal(Analysis):
     back_focal_distance: Tensor
     sensor_distance: Tensor
     focus_shift: Tensor
-    rms: Tensor
-    modulation: Tensor
-    frequency: Tensor
+    rms: Tensor | None
+    modulation: Tensor | None
+    frequency: Tensor | None
     depth_of_focus: Tensor
     expansion: Tensor
 
@@ -63,27 +65,37 @@ class Thermal(Analysis):
 
     def columns(self) -> dict[str, Tensor]:
         lengths = ("effective_focal_length", "back_focal_distance", "sensor_distance")
-        return {
+        columns = {
             "temperature": self.temperatures,
             **{name: getattr(self, name) for name in lengths},
             "focus_shift_um": 1e3 * self.focus_shift,
-            **{f"rms_{name}_um": 1e3 * rms for name, rms in zip(_LARGER, self.rms, strict=True)},
-            **{f"modulation_{name}": lowest for name, lowest in zip(_LARGER, self.modulation, strict=True)},
         }
+        if self.rms is not None:
+            columns |= {f"rms_{name}_um": 1e3 * rms for name, rms in zip(_LARGER, self.rms, strict=True)}
+        if self.modulation is not None:
+            columns |= {f"modulation_{name}": low for name, low in zip(_LARGER, self.modulation, strict=True)}
+        return columns
 
     def about(self) -> dict[str, Any]:
         return {
             "reference_temperature": float(temperature_of(self.lens)),
             "mount_expansion": float(self.expansion),
-            "frequency": float(self.frequency),
+            **({} if self.frequency is None else {"frequency": float(self.frequency)}),
             "depth_of_focus_um": 1e3 * float(self.depth_of_focus),
         }
 
     @styled
     def draw(self) -> Figure:
         """Focus shift between the limits of a quarter wave, RMS spot radius and modulation over temperature."""
-        figure, celsius = new_figure(10.5, 3.6), array(self.temperatures)
-        shift, spots, contrast = (ruled(panel) for panel in figure.subplots(1, 3))
+        curves = []
+        if self.rms is not None:
+            curves.append((1e3 * self.rms, "RMS spot radius (µm)", None))
+        if self.modulation is not None and self.frequency is not None:
+            cycles = number_text(float(self.frequency), 4)
+            curves.append((self.modulation, f"lowest modulation at {cycles} cycles/mm", 1.0))
+        count, celsius = 1 + len(curves), array(self.temperatures)
+        figure = new_figure({1: 5.2, 2: 7.4, 3: 10.5}[count], 3.6)
+        shift, *others = (ruled(panel) for panel in figure.subplots(1, count, squeeze=False)[0])
         depth = 1e3 * float(self.depth_of_focus)
         shift.axhspan(-depth, depth, color=FAINT, alpha=0.45, linewidth=0, label=f"±{depth:.3g} µm: λ/4 of wavefront")
         shift.plot(
@@ -94,19 +106,16 @@ class Thermal(Analysis):
             markersize=3.5,
             label="best focus, the sensor fixed",
         )
-        for curve, (name, colour) in enumerate(_LARGER.items()):
-            look: dict[str, Any] = dict(color=colour, markersize=3.5, label=f"sensor {name}")
-            spots.plot(celsius, 1e3 * array(self.rms[curve]), "o-", **look)
-            contrast.plot(celsius, array(self.modulation[curve]), "o-", **look)
-        cycles = number_text(float(self.frequency), 4)
-        names = "focus shift (µm)", "RMS spot radius (µm)", f"lowest modulation at {cycles} cycles/mm"
-        for panel, name in zip((shift, spots, contrast), names, strict=True):
+        for panel, (pair, _, top) in zip(others, curves, strict=True):
+            for curve, (name, colour) in zip(pair, _LARGER.items(), strict=True):
+                panel.plot(celsius, array(curve), "o-", color=colour, markersize=3.5, label=f"sensor {name}")
+            panel.set_ylim(0, top)
+        names = "focus shift (µm)", *(name for _, name, _ in curves)
+        for panel, name in zip((shift, *others), names, strict=True):
             panel.set_xlabel("temperature (°C)")
             panel.set_ylabel(name)
             panel.axvline(float(temperature_of(self.lens)), color=GREY, linewidth=0.8)
             panel.legend(fontsize=7.5)
-        spots.set_ylim(bottom=0)
-        contrast.set_ylim(0, 1)
         title = f"{self.lens.name or 'Lens'}\nover temperature, mount of {float(self.expansion):g}e-6/K"
         figure.suptitle(fill(title, figure.get_figwidth(), 10, bold=True), fontweight="bold", fontsize=10)
         return figure
@@ -118,6 +127,7 @@ def thermal(
     *,
     mount: str | float = "aluminium",
     samples: int = 9,
+    measure: str | Sequence[str] = MEASURES,
     modulation_frequency: float | None = None,
     fields: Points = None,
     wavelengths: Numbers = None,
@@ -126,47 +136,57 @@ def thermal(
 
     The lens expands from its own temperature, 20 °C without an environment, as of `Lens.at`; its air warms with it.
     mount: material of all spaces without a stated expansion and of the way to the sensor, of `materials.MOUNTS`, or
-    1e-6/K; samples: temperatures from the lowest to the highest; modulation_frequency: cycles/mm, by default half of
-    those that `rt.mtf` shows; fields: y or (x, y), by default the lens's own, of equal weight; wavelengths: µm. Focus
-    and spots are those of least RMS radius over fields and wavelengths. Differentiable, but for the modulation.
+    1e-6/K; samples: temperatures from the lowest to the highest; measure: those of "focus", "rms" and "mtf" that are
+    computed, the focal length and the focus always; the MTF takes most of the time; modulation_frequency: cycles/mm, by
+    default half of those that `rt.mtf` shows; fields: y or (x, y), by default the lens's own, of equal weight;
+    wavelengths: µm. Focus and spots are those of least RMS radius over fields and wavelengths. Differentiable, but for
+    the modulation.
     Warns NoThermalCoefficients. Raises ValueError for an unknown mount or a range that is none.
     """
     if len(temperatures) != 2 or not temperatures[0] < temperatures[1]:
         raise ValueError(f"{option('temperatures')} {[*temperatures]}: expected the lowest and the highest, °C")
     low, high = temperatures
+    measures = measure.split() if isinstance(measure, str) else [*measure]
+    if unknown := [name for name in measures if name not in MEASURES]:
+        raise ValueError(f"{option('measure')} {unknown[0]!r}: expected {', '.join(MEASURES)}")
     if samples < 2:
         raise ValueError(f"{option('samples', str(samples))}: expected 2 temperatures or more")
     lens, fields = setting(lens.at(mount=mount), fields, wavelengths)
     celsius = low + (high - low) * torch.linspace(0.0, 1.0, samples, **like(lens))
     lens.at(temperature=celsius[(celsius - temperature_of(lens)).abs().argmax()])  # warns of glasses, once
-    frequency = modulation_frequency
-    if frequency is None:
-        frequency = float(frequency_range(_focused(lens, fields), fields, 3)[1])
+    focused, frequency = _focused(lens, fields), modulation_frequency if "mtf" in measures else None
+    if "mtf" in measures and frequency is None:
+        frequency = float(frequency_range(focused, fields, 3)[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NoThermalCoefficients)
-        nominal = _focused(lens, fields).surfaces[-2].thickness - lens.surfaces[-2].thickness
-        rows = [_row(lens.at(temperature=each), fields, frequency, nominal) for each in celsius]
-    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+        nominal = focused.surfaces[-2].thickness - lens.surfaces[-2].thickness
+        rows = [_row(lens.at(temperature=each), fields, frequency, nominal, "rms" in measures) for each in celsius]
+    columns = [None if column[0] is None else torch.stack(column) for column in zip(*rows, strict=True)]
     if not bool(torch.isfinite(columns[3]).all()):
         raise NothingToShow("nothing to show over temperature: no ray reaches the image, or the lens has no focus")
     depth = 0.5e-3 * lens.primary / first_order(lens).image_na ** 2
-    cycles, expansion = lens.wavelengths.new_tensor([frequency, expansion_of(mount)])
+    cycles = None if frequency is None else lens.wavelengths.new_tensor(frequency)
+    expansion = lens.wavelengths.new_tensor(expansion_of(mount))
     focal, back, sensor, shift, rms, modulation = columns
-    return Thermal(
-        lens, fields, celsius, focal, back, sensor, shift, rms.T, modulation.T, cycles, depth.reshape(()), expansion
-    )
+    pairs = (None if pair is None else pair.T for pair in (rms, modulation))
+    return Thermal(lens, fields, celsius, focal, back, sensor, shift, *pairs, cycles, depth.reshape(()), expansion)
 
 
-def _row(lens: Lens, fields: Tensor, frequency: float, nominal: Tensor) -> tuple[Tensor, ...]:
+def _row(
+    lens: Lens, fields: Tensor, frequency: float | None, nominal: Tensor, spots: bool
+) -> tuple[Tensor | None, ...]:
     """The numbers of a `Thermal` at the temperature of a lens."""
     data, sensor, refocused = first_order(lens), lens.surfaces[-2].thickness, _focused(lens, fields)
-    rule, both = gauss_rings(_RINGS, **like(lens)), (lens, refocused)
-    spots = torch.stack([mean_rms_radius(each, *rule, **_scene(each, fields)) for each in both])
+    rule, both, radii, lowest = gauss_rings(_RINGS, **like(lens)), (lens, refocused), None, None
     shift = refocused.surfaces[-2].thickness - sensor - nominal
-    with torch.no_grad():
-        curves = [mtf(each, [frequency], fields=fields) for each in both]
-        lowest = torch.stack([torch.minimum(curve.tangential, curve.sagittal).amin() for curve in curves])
-    return data.effective_focal_length, data.back_focal_distance, sensor, shift, spots, lowest
+    if spots:
+        radii = torch.stack([mean_rms_radius(each, *rule, **_scene(each, fields)) for each in both])
+    if frequency is not None:
+        with torch.no_grad():
+            cycles = lens.wavelengths.new_tensor([frequency])
+            curves = [modulations(aligned(each, 3), fields, cycles) for each in both]
+            lowest = torch.stack([torch.minimum(*pair).amin() for pair in curves])
+    return data.effective_focal_length, data.back_focal_distance, sensor, shift, radii, lowest
 
 
 def _scene(lens: Lens, fields: Tensor) -> dict[str, Any]:

@@ -51,10 +51,12 @@ ROWS = {
     "bounds": option("of variables: sensor:57.5..58 curvature_3:-0.04..0 (mm, 1/mm)", "NAME:LOW..HIGH", nargs="+"),
     "hold": option(
         "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "
-        "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step",
+        "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step; in "
+        "addition to the conditions of the lens",
         "NAME=VALUE",
         nargs="+",
     ),
+    "no_hold": option("without the conditions of the lens (default: with them)"),
     "step": option(
         "unit of the variables, of which --rate-optics is a part in mm: sag at the edge (default), or blur, the RMS "
         "spread of the rays of all fields: the same for every number of any lens",
@@ -194,8 +196,8 @@ ROWS = {
 _OF_ONE_RUN = ("model", "seed")
 #: Options that the help page shows; settings of a file, or of --set, are all of them.
 _SHOWN = (
-    *("vary", "bounds", "hold", "start", "f_number", "wavelengths", "near", "far", "fields", "sensor", "as_built"),
-    *("grade", "optimizer", "turns", "epochs", "batch", "noise"),
+    *("vary", "bounds", "hold", "no_hold", "start", "f_number", "wavelengths", "near", "far", "fields", "sensor"),
+    *("as_built", "grade", "optimizer", "turns", "epochs", "batch", "noise"),
 )
 
 

@@ -494,9 +494,12 @@ on request: {", ".join(ON_REQUEST)}""",
         double_gauss --merit spot --vary curvature thickness --hold efl=99.5 --as-built --grade precision -o robust.zmx
         lens.zmx --stock stock.sqlite --vary curvature thickness --hold efl=50 -o of_stock.zmx
         lens.zmx --test-plates plates.csv -o with_plates.zmx
+        warm.zmx --merit spot --vary curvature sensor spacer --mounts aluminium titanium invar peek -o athermal.zmx
         lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
         lens.zmx --cycles 100 --resume best.json --checkpoint best.json -o better.zmx""",
-        *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses", AS_BUILT,
+        *LENS, "ray_aiming", *MERIT, FREEDOM, "glasses",
+        Option("mounts", None, "MATERIAL", "materials for spacer and barrel in --vary, as aluminium stainless-304, or "
+            "1e-6/K (default: all listed materials)", nargs="+"), AS_BUILT,
         group(
             "parts of stock and test plates",
             Option("stock", file_name, "INDEX", "replace elements and cemented groups by parts of this index, which "
@@ -1017,11 +1020,13 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         """
         double_gauss --range -20 60 --mount aluminium --plot thermal.png
         cemented_achromat --mount invar --modulation-frequency 40 --json
-        lens.zmx --range -40 85 --samples 6 --mount 12.5 -o thermal.csv""",
+        lens.zmx --range -40 85 --samples 6 --mount 12.5 --measure focus rms -o thermal.csv""",
         *LENS, CONDITIONS, plot("focus shift, spot and MTF"), TABLE, "fields",
         Option("temperatures", finite, ("LOW", "HIGH"), "lowest and highest temperature, °C (default -20 60)",
             flag="--range", nargs=2),
         row("samples", "temperatures", default=9),
+        Option("measure", str.lower, "WORD", "what is computed besides the focal length: focus, rms, mtf (default: "
+            "all; the MTF takes most of the time)", nargs="+", choices=("focus", "rms", "mtf")),
         Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
     ),
     _command(
@@ -1145,7 +1150,10 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
             "there, as .zmx files"),
         row("grade", "tolerances of a published grade instead of the file's"),
         row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
-            "those of the file or the grade, and index=0 leaves one out", default=""),
+            "those of the file or the grade, and index=0 leaves one out; element_decenter_radial=0.02 is the magnitude "
+            "of a decentre in a random direction", default=""),
+        switch("radial", "decentres, tilts and wedges of the grade and of --limits are magnitudes in a random "
+            "direction, x and y linked; wedge_radial=0.01 is one of these alone"),
         Option("criterion", help="rms, the RMS spot radius in µm over fields and wavelengths by their "
             "weights, each field about the centroid of its light, of an afocal lens that of angle, the RMS angle in "
             "mrad of the rays; wavefront, the RMS wavefront in waves less mean and tilt; mtf@30, the MTF of "
@@ -1160,8 +1168,16 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         Option("goal", criterion_value, "VALUE", "value of the criterion that a good lens reaches, in its unit; alone "
             "it reports the share of good lenses (yield), with --yield it tightens the limits"),
         Option("yield_", positive_finite, "SHARE", "a share of the lenses, 0.9 by default, whose criterion is "
-            "reported; with --goal, limits are tightened at least total tightness until this share reaches the goal, "
-            "by second order corrected by traced lenses", flag="--yield"),
+            "reported; with --goal, limits are tightened at least cost until this share reaches the goal, by second "
+            "order corrected by traced lenses", flag="--yield"),
+        Option("workshop", str.lower, "GRADE", "commercial, precision, high (default) or any: the grade whose figures "
+            "are the finest limits that --increment and --yield propose, in steps and alike along x and y; any: exact "
+            "limits of any size", choices=("commercial", "precision", "high", "any"), default="high"),
+        Option("costs", None, "KIND=WEIGHT", "weights of the costs of tolerances, which are inverse to their limits "
+            "and 1 at the finest of the workshop: element_decenter=3 index=0.5", nargs="+", default=""),
+        switch("hold", "compensators ignore the conditions of the lens; by default they stay within those on the "
+            "thickness, or edge, that they adjust, as air_thickness>=1 (MNCA) and bfd>=30", flag="--no-hold",
+            default=True),
         "fields", row("rings", "rings of the pupil (default 4)"),
         Option("arms", count, "N", "of the pupil, 4·rings by default"),
         Option("light_loss", positive_finite, "SHARE", "share of the light of the nominal lens that a lens may lose; "

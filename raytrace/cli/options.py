@@ -264,7 +264,8 @@ FREEDOM = group(
     about="Variables, in quotes: 'curvature thickness' (all powered surfaces, all gaps), curvature:1-4,7 conic:3 a4:3 "
     "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); pickups and solves: "
     "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "
-    "'thickness:8=marginal_height(0)' 'curvature:7=marginal_angle(-0.1)'.",
+    "'thickness:8=marginal_height(0)' 'curvature:7=marginal_angle(-0.1)'. In optimize, of a lens with temperatures: "
+    "spacer (materials of all spacers), spacer:4, barrel (one material).",
 )  # fmt: skip
 
 #: --as-built and its options: `tolerancing.as_built.AsBuilt`.

@@ -115,6 +115,7 @@ def variables(lens: Lens, settings: CodesignSettings, *, catalogs: Sequence[str 
         settings.vary,
         bounds=settings.bounds,
         hold=settings.hold,
+        stored=not settings.no_hold,
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,

@@ -291,7 +291,7 @@ class Variables(Owned):
         it is then not a parameter but solved for, and its bounds count in `violation`. Further conditions, of the
         constraint syntax of `optimize` as "total_track<=80", "buildable", thicknesses within their limits, and
         "catalog", model glasses within the hull of the catalogs' glasses, are met by `project`, and so are the
-        conditions of the lens of other quantities.
+        conditions of the lens of other quantities, unless `stored` is False.
     catalog: of glasses, names or AGF files, by default those of the lens, else SCHOTT; glasses: a selection of them,
         as "preferred price<=3" (`rt.glasses`).
     step: unit of the parameters: "sag" as of `Variable`, or "blur": the change that spreads the rays of all fields by
@@ -310,6 +310,7 @@ class Variables(Owned):
         *,
         bounds: Mapping[str, tuple[float, float]] | str | None = None,
         hold: str = "",
+        stored: bool = True,
         glass_thickness: tuple[float, float] | None = None,
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
@@ -329,7 +330,7 @@ class Variables(Owned):
         self.conditions = tuple(word for word in words if word not in efl)
         self._all = _variables(self.design, vary)
         self.held = self._held(" ".join(efl))
-        self.conditions = (*_of_lens(self.design.lens, words), *self.conditions)
+        self.conditions = (*(_of_lens(self.design.lens, words) if stored else ()), *self.conditions)
         self.variables = tuple(v for v in self._all if self.held is None or v is not self.held.by)
         self.names = tuple(variable.name for variable in self._all)
         lower, upper = bounds_of(lens, self.design.variables, bounds)

@@ -35,6 +35,7 @@ from raytrace.optimization.problem import (
     typical_of,
 )
 from raytrace.optimization.quantities import Quantity, quantity_of
+from raytrace.optimization.spacer_choice import choose_spacers, materials_of, without_glasses, without_spacers
 from raytrace.optimization.stock_fit import StockFit
 from raytrace.optimization.variables import DesignVariables, bounds_of, design_variables, without_glass
 from raytrace.stock.index import parts_of
@@ -77,6 +78,7 @@ def optimize(
     glasses: str | Sequence[str] = "",
     stock: str | PathLike | None = None,
     test_plates: str | PathLike | Sequence[TestPlate] | None = None,
+    mounts: str | Sequence[str] = "",
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
@@ -101,13 +103,14 @@ def optimize(
     cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
     (`optimization.glass_choice`); glasses: a selection of them, as "preferred price<=3 transmittance:0.4>=0.98", by
-    default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own.
+    default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own. mounts: materials
+    for "spacer" and "barrel" in vary, as "aluminium titanium 12.5" (`optimization.spacer_choice`).
     stock: an index of parts (`rt.stock_index`): the optimised lens takes the best part, in its best orientation, for
     each element and cemented group with a variable curvature, one after the other, and the rest is optimised after
     each; test_plates: a list (.csv, `stock.plates.read_plates`), from which each variable radius takes a value likewise
-    (`optimization.fitting`); `Optimized.fitted` reports both. log: a file
-    with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file of the same
-    lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
+    (`optimization.fitting`); `Optimized.fitted` reports both.
+    log: a file with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file
+    of the same lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
     rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
     after each cycle, except those of the choice of glasses, with its report and lens, while the system is opened the
     best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
@@ -127,6 +130,18 @@ def optimize(
     for name, path in (("checkpoint", checkpoint), ("resume", resume)):
         if log is not None and path is not None and os.path.realpath(log) == os.path.realpath(path):
             raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
+    vary, spaces = without_spacers(lens, vary)
+    if spaces:
+        given = {"log": log, "checkpoint": checkpoint, "resume": resume, "loss": loss}
+        given |= {"stock": stock, "test_plates": test_plates}
+        given |= {"merit": merit} if callable(merit) else {}
+        for name, setting in given.items():
+            if setting is not None:
+                raise NoProblem(f"{option('vary', 'spacer')} goes without {option(name)}: leave one out")
+        return _with_spacers(
+            lens, spaces, materials_of(mounts), vary, merit, hold, until, cycles=cycles, bounds=bounds,
+            as_built=as_built, paths=paths, catalog=catalog, glasses=glasses, progress=progress, watch=watch,
+        )  # fmt: skip
     warn_of_filling(lens, field_points(None, like=lens))
     model, chosen = without_glass(design_variables(lens, vary), vary)
     pool = pool_of(lens, catalogs_of(lens, catalog), glasses) if chosen else None
@@ -296,6 +311,46 @@ def _refuse_beside_fit(fit: str, **given: bool) -> None:
         if is_given:
             words = option("vary", "glass") if name == "glass" else option(name)
             raise NoProblem(f"{words} does not go with {option(fit)}: leave one of them out")
+
+
+def _with_spacers(
+    lens: Lens,
+    spaces: Sequence[tuple[int, ...]],
+    materials: dict[str, float],
+    vary: str | Sequence[str | Vary] | None,
+    merit: Any,
+    hold: Any,
+    until: float,
+    *,
+    cycles: int | None,
+    **settings: Any,
+) -> Optimized:
+    """The optimised lens with the best materials of its spacers; settings: of `optimize`."""
+    started = time.monotonic()
+    fixed = without_glasses(vary)
+
+    def problem(lens: Lens) -> Problem:
+        rows, held = specified(lens, merit, hold)
+        model = design_variables(lens, fixed)
+        return Problem(model, rows.rows, conditions_in_unit(lens, held, rows.unit), **rows.options)
+
+    def optimised(lens: Lens, *, cycles: int | None) -> Optimized:
+        words = vary if cycles is None else fixed
+        left = None if np.isinf(until) else max(until - time.monotonic(), 1e-3)
+        more = settings if cycles is None else {**settings, "progress": None, "watch": None}
+        count = whole if cycles is None else min(cycles, whole or cycles)
+        return optimize(lens, merit=merit, vary=words, hold=hold, cycles=count, seconds=left, **more)
+
+    whole = cycles
+    first = optimised(lens, cycles=None)
+    best, steps, results = choose_spacers(first, spaces, materials, problem, optimised, until)
+    return dataclasses.replace(
+        best, before=first.before, merit_before=first.merit_before, variables_before=first.variables_before,
+        values_before=first.values_before, contributions_before=first.contributions_before,
+        cycles=sum(each.cycles for each in results), evaluations=sum(each.evaluations for each in results),
+        seconds=time.monotonic() - started, glasses=tuple(step for each in results for step in each.glasses),
+        spacers=tuple(steps),
+    )  # fmt: skip
 
 
 def _attained(

@@ -23,6 +23,7 @@ from raytrace.optimization.merit import configurations_of
 from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.problem import Expectation
+from raytrace.optimization.spacer_choice import SpacerStep
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
@@ -83,7 +84,8 @@ class Optimized(Result):
     contributions_before, contributions: (R,) of each to the square of the merit, of sum 1. history: (cycles, 5) merit,
     largest violation of a condition, step, damping and seconds of every cycle of the last descent. cycles, evaluations,
     seconds: of the whole optimisation; stopped: a key of `checkpoint.STOPPED`. glasses: the steps in which variable
-    glasses were chosen; chosen_from: the glasses that could be chosen. conditions: targets and values reached of
+    glasses were chosen; chosen_from: the glasses that could be chosen; spacers: the steps in which materials of spacers
+    were chosen. conditions: targets and values reached of
     conditions and boundaries. as_built: spots of the lens as built, if it is a term of the merit, which then includes
     it. loss: the way of a loss, in the place of rows. between: spots between fields, wavelengths or rays that are more
     than 1.5 times those beside them. fitted: the parts of stock or test plates that the lens has taken.
@@ -108,6 +110,7 @@ class Optimized(Result):
     stopped: str
     glasses: tuple[GlassStep, ...] = ()
     chosen_from: GlassList | None = None
+    spacers: tuple[SpacerStep, ...] = ()
     conditions: tuple[Attained, ...] = ()
     as_built: AsBuiltChange | None = None
     loss: LossReport | None = None
@@ -185,6 +188,7 @@ class Optimized(Result):
                     for i in self.rows
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
+                **({"spacers": [step.document() for step in self.spacers]} if self.spacers else {}),
                 **({"chosen_from": self.chosen_from.summary} if self.chosen_from else {}),
                 **({"fitted": self.fitted.document()} if self.fitted else {}),
                 **({"as_built": dataclasses.asdict(self.as_built)} if self.as_built else {}),
@@ -204,6 +208,7 @@ class Optimized(Result):
             f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             *([f"  {self.as_built}"] if self.as_built else []),
             *([f"  {line}" for line in self.loss.lines()] if self.loss else []),
+            *(f"  {step.words}; merit {step.reached:.6g}, predicted {step.predicted:.6g}" for step in self.spacers),
             *self._unsharp_start(),
             *(f"  {spot}" for spot in self.between),
             "",

@@ -35,6 +35,7 @@ DISTRIBUTIONS = {
     "normal": "truncated at the limits, which lie `sigmas` standard deviations from their middle",
     "uniform": "all values between the limits are equally likely",
     "parabolic": "density rising with the square of the distance from the middle of the limits",
+    "disc": "density rising with the distance from the middle of the limits: a radial error is uniform over its disc",
     "end_points": "one of the two limits, each with probability 1/2",
     "table": "linear between the points of `density`",
 }
@@ -62,7 +63,8 @@ class Tolerance:
     parameter: of "parameter", a name of `parameter_paths`, as "a4", "tilt_x".
     term: of "zernike", Noll's number of the term; of "fringe", that of the fringe terms.
     group: the n rows of a group, such as the components of a radial decentre, are drawn together: a random direction in
-        n dimensions, times √n, times a number from the distribution of a row. All reach their limits at once.
+        n dimensions, times √n, times a number from the distribution of a row. All reach their limits at once. Two rows
+        along x and y of the same surfaces, each with limits of R/√2, are a radial error of the magnitude R.
     density: of the distribution "table": fractions of the way from `minimum` to `maximum`, rising, and the density.
     configuration, operand: of "operand", the configuration (from 1) and its place in `lens.operands` (from 0).
     source: file and line, or the grade that the limits come from.

@@ -19,20 +19,24 @@ from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.attained import NotReached, attained_by
 from raytrace.optimization.merit import DefaultMerit, Merit
 from raytrace.plotting.style import GREY, INK, new_figure, styled
+from raytrace.settings import GRADES
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
 from raytrace.system.tolerance_data import Tolerance
 from raytrace.tolerancing import grades
+from raytrace.tolerancing.compensators import within_conditions
 from raytrace.tolerancing.criteria import Criterion, Sampling, criterion_of
+from raytrace.tolerancing.makeable import Makeable
 from raytrace.tolerancing.monte_carlo import monte_carlo
 from raytrace.tolerancing.perturbation import Perturbation
+from raytrace.tolerancing.radial import limits_alone
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.second_order import SecondOrder
 from raytrace.tolerancing.study import Study, moments, views_of, with_changes
-from raytrace.tolerancing.table import BadTolerance, ToleranceTable, groups_of
-from raytrace.tolerancing.tightening import limited_to_change, limited_to_yield
-from raytrace.words import RaytraceWarning, calling_level, option
+from raytrace.tolerancing.table import BadTolerance, ToleranceTable
+from raytrace.tolerancing.tightening import Proposal, limited_to_change, limited_to_yield
+from raytrace.words import RaytraceWarning, calling_level, did_you_mean, option
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +45,7 @@ if TYPE_CHECKING:
 PERCENTILES = (98, 90, 80, 50, 20, 10, 2)
 _MODEL = 2**15  # draws of the second-order model
 _CHECKED, _UNEXPLAINED = 64, 0.25  # lenses that the model is compared with; accepted part of their standard deviation
+_ABOVE, _CLOSE = 1 + 1e-6, 0.003  # accepted part of an increment, and error of a yield
 _NEGATIVE = 0.02  # accepted share of draws whose mean square is negative by second order
 
 
@@ -55,7 +60,9 @@ class ToleranceAnalysis(Result):
     better: "smaller" or "larger", which values of the criterion are better; angle: radians of its unit, 0 for no angle.
     nominal: () of the criterion, of the nominal lens with its compensators at their best. minimum, maximum: (N,) change
     of the criterion by each tolerance at its limits, compensated; second_minimum, second_maximum: (N,) the same by
-    second order; slope: (N,) its derivative times the half width.
+    second order; slope: (N,) its derivative times the half width. direction: (N,) of a radial error the direction of
+    its largest change, which is that at the maximum, degrees from x to y; the change at the minimum is that of the
+    opposite direction; nan of other rows.
     estimated: () nominal ± √Σ ½(Δmin² + Δmax²), to the worse, as OpticStudio. expected: () the mean of the criterion by
     second order; expected_square: () that of its square, of the MTF that of 1 - MTF. predicted: (K,) draws of the
     second-order model, whose compensators keep their limits. holds: whether that model describes the lens: why not, or
@@ -66,7 +73,9 @@ class ToleranceAnalysis(Result):
     `light_loss`.
     unsettled: how many lenses traced now had compensators that still gained 1e-6 of the mean square in the last step.
     goal: of the criterion, if one was requested; share: of lenses, whose criterion is listed; given: the tolerances
-    before their limits were tightened, or None.
+    before their limits were tightened, or None. conditions: of the lens, that limit compensators, in words. missed: why
+    the tightened limits do not reach the increment or the yield, or ""; finest: the first rows of those at the finest
+    limit of the workshop; cost: of the given and of these limits, 1 for the finest limit of one tolerance, or None.
     """
 
     lens: Lens
@@ -88,6 +97,7 @@ class ToleranceAnalysis(Result):
     lost: Tensor
     lost_minimum: Tensor
     lost_maximum: Tensor
+    direction: Tensor
     light_loss: float = 0.05
     holds: str = ""
     configurations: int = 1
@@ -97,6 +107,11 @@ class ToleranceAnalysis(Result):
     goal: float | None = None
     share: float = 0.9
     given: ToleranceTable | None = None
+    conditions: tuple[str, ...] = ()
+    missed: str = ""
+    finest: tuple[int, ...] = ()
+    cost: tuple[float, float] | None = None
+    workshop: str = "any"
     better: str = "smaller"
 
     COLUMNS = property(
@@ -109,6 +124,7 @@ class ToleranceAnalysis(Result):
             Column("second_minimum", self.unit, ".5f", "2nd order\nat min."),
             Column("second_maximum", self.unit, ".5f", "2nd order\nat max."),
             Column("slope", self.unit, ".5f", "slope ×\nhalf width"),
+            Column("direction", "°", ".4g", "worst\ndirection"),
             Column("lost", "%", ".3g", "light\nlost"),
             Column("share", "%", ".4g"),
             Column("trials", self.unit, ".5f"),
@@ -138,10 +154,7 @@ class ToleranceAnalysis(Result):
     @property
     def labels(self) -> list[str]:
         """Kind and place of every row in words; of the first row of a group those of all its rows."""
-        labels = self.tolerances.labels
-        for first, *_, last in (places for places in groups_of(self.tolerances.rows) if len(places) > 1):
-            labels[first] = f"{self.tolerances[first].name} … {labels[last]}"
-        return labels
+        return self.tolerances.names
 
     def percentile(self, percent: float) -> Tensor:
         """The criterion that so many percent of the trials meet or surpass; failed trials are worse than all."""
@@ -164,8 +177,13 @@ class ToleranceAnalysis(Result):
         """The tolerances whose limits were tightened, with the factor, the most tightened first."""
         if self.given is None:
             return []
-        pairs = zip(self.tolerances, self.given, self.tolerances.labels, strict=True)
-        factors = [(label, _factor(new, old)) for new, old, label in pairs]
+        hidden = {error.places[1] for error in self.tolerances.radial.values()}
+        rows = enumerate(zip(self.tolerances, self.given, self.tolerances.labels, self.labels, strict=True))
+        factors = [
+            (name if n in self.tolerances.radial else label, _factor(new, old))
+            for n, (new, old, label, name) in rows
+            if n not in hidden
+        ]
         return sorted((pair for pair in factors if pair[1] < 1), key=lambda pair: pair[1])
 
     def at_limit(self, number: int) -> int:
@@ -230,22 +248,21 @@ class ToleranceAnalysis(Result):
             write_lens(lens, folder / f"{name}.zmx", catalogs=catalogs)
 
     def columns(self) -> dict[str, Tensor]:
-        order = self.worst
-        return {
+        order, (low, high) = self.worst, self.tolerances.ranges
+        lost = 100 * torch.maximum(self.lost_minimum, self.lost_maximum)
+        columns = {
             "tolerance": order,
-            "minimum": self.tolerances.minimum[order],
-            "maximum": self.tolerances.maximum[order],
+            "minimum": low[order],
+            "maximum": high[order],
             "unit": order,
             "change_minimum": self.minimum[order],
             "change_maximum": self.maximum[order],
             "second_minimum": self.second_minimum[order],
             "second_maximum": self.second_maximum[order],
             "slope": self.slope[order],
-        } | (
-            {"lost": lost[order]}
-            if bool((lost := 100 * torch.maximum(self.lost_minimum, self.lost_maximum)).any())
-            else {}
-        )
+        }
+        columns |= {"direction": self.direction[order]} if bool(self.direction.isfinite().any()) else {}
+        return columns | ({"lost": lost[order]} if bool(lost.any()) else {})
 
     def words(self) -> dict[str, Sequence[str]]:
         return {"tolerance": self.labels, "unit": [row.unit for row in self.tolerances]}
@@ -267,6 +284,8 @@ class ToleranceAnalysis(Result):
             summary |= {"best": float(ends[0]) * self.sign, "worst": float(ends[1]) * self.sign}
             summary |= {"failed": len(self.trials) - len(good), "lost_light": float(self.lost.max())}
             summary |= {f"percent_{p}": float(self.percentile(p)) for p in PERCENTILES}
+        if self.cost is not None:
+            summary |= {"cost_given": self.cost[0], "cost": self.cost[1], "target_reached": not self.missed}
         if self.goal is not None:
             reached = self.sign * self.predicted <= self.sign * self.goal
             summary |= {"goal": self.goal, "yield_by_second_order": float(reached.double().mean())}
@@ -298,6 +317,8 @@ class ToleranceAnalysis(Result):
             about.append(f"as an angle, divided by the focal length, mrad: {listed}")
         if not self.tolerances.compensators:
             about.append("no compensator")
+        if self.conditions:
+            about.append(f"compensators within the conditions of the lens: {', '.join(self.conditions)}")
         if len(self.trials):
             about.append(
                 f"{len(self.trials):,} trials (seed {self.seed}): mean {summary['mean']:.6g}, "
@@ -330,6 +351,16 @@ class ToleranceAnalysis(Result):
             about.append(
                 f"limits tightened of {len(drawn)} of {len(self.tolerances)} tolerances{': ' * bool(drawn)}{listed}"
             )
+            if self.cost is not None:
+                about.append(f"relative cost {self.cost[0]:.4g} of the given limits, {self.cost[1]:.4g} of these")
+            if self.finest:
+                names = self.tolerances.names
+                about.append(
+                    f"at the finest limit of the workshop ({self.workshop}): "
+                    + ", ".join(names[n] for n in self.finest)
+                )
+            if self.missed:
+                about.append(f"the target is not reached: {self.missed}")
         if self.unsettled:
             about.append(f"compensators of {self.unsettled} lenses had not settled when their steps ended")
         tables = [Table(self.columns(), about, self.tolerances.notes)]
@@ -390,12 +421,16 @@ def tolerance(
     *,
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
+    radial: bool = False,
     criterion: str = "rms",
     trials: int = 1000,
     seed: int = 0,
     increment: float | None = None,
     goal: float | None = None,
     yield_: float | None = None,
+    workshop: Literal["commercial", "precision", "high", "any"] = "high",
+    costs: str | Sequence[str] = "",
+    hold: bool = True,
     fields: Tensor | Sequence | None = None,
     rings: int | None = None,
     arms: int | None = None,
@@ -419,6 +454,8 @@ def tolerance(
     grade: tolerances of published grades instead of the file's, see `tolerances`.
     limits: words and kinds with their limits ±, "radius=0.1% thickness=0.02 element_tilt=0.05"; they replace those of
         the file or the grade, and "index=0" leaves one out.
+    radial: whether decentres, tilts and wedges of the grade and of limits are magnitudes in a random direction; by
+        default x and y are separate. "wedge_radial=0.01" is one of these alone.
     criterion: "rms", the RMS spot radius in µm over fields and wavelengths by their weights, each field about the
         centroid of its light, of an afocal lens that of "angle", the RMS angle in mrad of the rays; "wavefront", the
         RMS wavefront in waves less mean and tilt; "mtf@30", the MTF of diffraction at 30 cycles/mm, mean of
@@ -428,12 +465,20 @@ def tolerance(
         compensators of every lens bring it to its best.
     trials: number of perturbed and compensated lenses, 0 for none; seed: trial k of a seed is the same lens always.
     increment: inverse sensitivity: limits are tightened until no error alone, at a limit, makes the criterion worse by
-        more than this, in its unit. Tighter limits stay.
+        more than this, in its unit. Tighter limits stay. Radial errors are in their worst direction.
     goal: value of the criterion that a good lens reaches, in its unit: its largest, of the MTF its smallest. Alone it
         reports the share of good lenses (yield); with `yield_` it tightens the limits. Warns GoalMissed of one that the
         nominal lens misses.
     yield_: a share of the lenses, 0.9 by default, whose criterion is reported; with `goal`, limits are tightened at
-        least total tightness until this share reaches the goal, by second order corrected by traced lenses.
+        least cost until this share reaches the goal, by second order corrected by traced lenses.
+    workshop: whose figures, those of a grade, are the finest limits that are proposed. Proposals are in steps,
+        as 0.005 mm of decentres, ± alike where the given limits are, and the same along x and y. "any": exact limits,
+        of any size, each row apart.
+    costs: weights of the costs of tolerances, which are inverse to their limits and 1 at the finest of the workshop:
+        "element_decenter=3 index=0.5", words as of `limits`.
+    hold: whether compensators stay within the limits that conditions of the lens put on the thickness, or the edge,
+        that they adjust, as air_thickness>=1 (MNCA), bfd>=30 or thickness:7<=60; other conditions hold of the nominal
+        lens.
     fields: y, (x, y) or (2, F), alike in weight; by default the lens's own with their weights and, as errors are not
         symmetric, mirrored along y if the lens is round, at half the weight each: the criterion of the nominal lens is
         that of its own fields.
@@ -447,24 +492,32 @@ def tolerance(
     checkpoint: a file (.jsonl) of finished trials, from which an interrupted study resumes.
     share: of this process (`shards.share()`), if all processes of a job call alike.
     progress: (count, unit) -> a progress bar.
-    Warns NotReached of conditions of the lens that it does not meet before it is perturbed.
+    Warns NotReached of conditions of the lens that it does not meet before it is perturbed, GoalMissed where limits
+    that the workshop makes do not reach the increment or the yield.
     Raises BadTolerance for tolerances or compensators that the lens does not have, ValueError for unknown options.
     """
     if trials < 0:
         raise ValueError(f"trials {trials}: expected 0 or more")
     if tolerances is None:
-        tolerances = grades.tolerances(lens, limits, grade=grade)
-    elif grade or limits:
-        raise ValueError(f"`tolerances` are given: leave {option('grade')} and {option('limits')} out")
+        tolerances = grades.tolerances(lens, limits, grade=grade, radial=radial)
+    elif grade or limits or radial:
+        left_out = f"{option('grade')}, {option('limits')} and {option('radial')}"
+        raise ValueError(f"`tolerances` are given: leave {left_out} out")
     if not len(tolerances):
         raise BadTolerance(f"no tolerances; give rows, a {option('grade')} or {option('limits')}")
     afford(8.0 * trials * len(tolerances), f"the errors of {trials:,} lenses", helps="ask for fewer {trials}")
     if yield_ is not None and not 0 < yield_ < 1:
         raise ValueError(f"yield {yield_:g}: expected a share of the lenses between 0 and 1, as 0.9")
+    if workshop != "any" and workshop not in GRADES:
+        raise ValueError(f"workshop {workshop!r}{did_you_mean(workshop, GRADES)}: expected {', '.join(GRADES)} or any")
     if not 0 <= light_loss <= 1:
         raise ValueError(f"light_loss {light_loss:g}: expected a share of the light between 0 and 1, as 0.05")
 
-    for condition in attained_by(lens):
+    limits_by_conditions: list[str] = []
+    if hold:
+        compensators, limits_by_conditions = within_conditions(lens, tolerances.compensators)
+        tolerances = dataclasses.replace(tolerances, compensators=compensators)
+    for condition in attained_by(lens) if hold else ():
         if not (condition.met or condition.row):
             warnings.warn(f"the nominal lens: {condition}", NotReached, stacklevel=calling_level())
 
@@ -491,17 +544,27 @@ def tolerance(
             if yield_ is not None:
                 raise BadTolerance(message)
             warnings.warn(message, GoalMissed, stacklevel=calling_level())
+
+        def harm(errors: Tensor) -> Tensor:
+            return study.harm(errors)[0]
+
+        def makeable(tolerances: ToleranceTable) -> Makeable | None:
+            return None if workshop == "any" else Makeable(lens, tolerances, workshop, costs)
+
+        proposal = Proposal(tolerances)
+
         if increment is not None:
-            tolerances = limited_to_change(tolerances, lambda errors: study.harm(errors)[0], increment)
-            study = Study(views, tolerances, light_loss)
+            proposal = limited_to_change(tolerances, harm, increment, makeable(tolerances))
+            tolerances, study = proposal.tolerances, Study(views, proposal.tolerances, light_loss)
         second = study.second_order()
         if goal is not None and yield_ is not None:
-            tolerances = limited_to_yield(
+            proposal = limited_to_yield(
                 tolerances, second, lambda errors: study.compensated(errors.to(study.half))[0],
-                chosen.quantity_of(goal), yield_, seed + 1,
+                chosen.quantity_of(goal), yield_, seed + 1, makeable(tolerances),
             )  # fmt: skip
-            study = Study(views, tolerances, light_loss)
-        alone = torch.cat([tolerances.alone(each) for each in (tolerances.minimum, tolerances.maximum)]).to(study.half)
+            tolerances, study = proposal.tolerances, Study(views, proposal.tolerances, light_loss)
+        *limited, directions = limits_alone(tolerances, harm)
+        alone = torch.cat(limited).to(study.half)
         changes, light = study.harm(alone)
         start, slope = second(torch.zeros_like(alone[:1]))
         seconds = chosen.value(second(alone)[0].clamp_min(0)) - chosen.value(start.clamp_min(0))
@@ -510,19 +573,38 @@ def tolerance(
         predicted, expected, mean_square, negative = second.means(drawn, mean, variance, chosen.value)
         holds = _broken(study, second, drawn[:_CHECKED], float(negative))
         values, moved, kept = monte_carlo(study, trials, seed, checkpoint=checkpoint, share=share, progress=progress)
+    missed = _missed(tolerances, changes, increment) if increment is not None else ""
+    if goal is not None and yield_ is not None and proposal.share < yield_ - max(2 * proposal.error, _CLOSE):
+        missed = f"{100 * proposal.share:.3g} % of the lenses reach the goal instead of {100 * yield_:.4g} %"
+    if missed:
+        missed += f", as the workshop ({workshop}) makes no finer limits" if proposal.finest else ""
+        warnings.warn(f"the proposed limits miss the target: {missed}", GoalMissed, stacklevel=calling_level())
+    priced = makeable(given) if tolerances is not given else None
     low, high = (chosen.sign * changes).chunk(2)
     light_low, light_high = (1 - light).chunk(2)
     rss = (0.5 * (low**2 + high**2)).nansum().sqrt()
     return ToleranceAnalysis(
         lens=lens, tolerances=tolerances, criterion=chosen.name, unit=chosen.unit, nominal=nominal, minimum=low,
         maximum=high, second_minimum=seconds[: len(low)], second_maximum=seconds[len(low) :],
-        slope=_slope(chosen, start[0], slope[0], second.H, tolerances.alone(study.half)),
+        slope=_slope(chosen, start[0], slope[0], second.H, 0.5 * (alone[len(low) :] - alone[: len(low)])),
+        direction=directions,
         estimated=nominal + chosen.sign * rss, expected=expected, expected_square=mean_square, predicted=predicted,
         trials=values, changes=moved, lost=1 - kept, lost_minimum=light_low, lost_maximum=light_high,
         light_loss=light_loss, holds=holds, configurations=len(views), seed=seed, unsettled=study.unsettled, goal=goal,
         share=0.9 if yield_ is None else yield_, given=None if tolerances is given else given,
+        conditions=tuple(limits_by_conditions), missed=missed, finest=proposal.finest, workshop=workshop,
+        cost=None if priced is None else (priced.cost(given), priced.cost(tolerances)),
         better="smaller" if chosen.sign > 0 else "larger", angle=chosen.angle,
     )  # fmt: skip
+
+
+def _missed(tolerances: ToleranceTable, changes: Tensor, increment: float) -> str:
+    """The tolerances whose changes (2 N,), at their limits, exceed an increment."""
+    worst = torch.maximum(*changes.nan_to_num(torch.inf).chunk(2))
+    names = tolerances.names
+    beyond = [names[n] for n in torch.argsort(worst, descending=True).tolist() if float(worst[n]) > increment * _ABOVE]
+    more = f" and {len(beyond) - 3} others" if len(beyond) > 3 else ""
+    return f"{', '.join(beyond[:3])}{more} exceed the change of {increment:g}" if beyond else ""
 
 
 def _broken(study: Study, model: SecondOrder, errors: Tensor, negative: float) -> str:

@@ -2,12 +2,14 @@
 
     radius=0.1% thickness=0.02 element_tilt=0.05      a kind, or a word of WORDS, and its limits ±
     power:2-4=3 irregularity:1=-0.2..0.5              of surfaces alone; a minimum and a maximum
+    element_decenter_radial=0.02 wedge_radial=0.01    in a direction that is random, x and y linked
     index=0                                           no such tolerance
 
 GRADES has the figures of each grade and where they are printed.
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -115,11 +117,15 @@ def _followers(lens: Lens) -> set[tuple[str, int]]:
 
 
 class Word(NamedTuple):
-    """A word of limits: the kinds of its rows, and of rows that it replaces; where: its places in a lens."""
+    """A word of limits: the kinds of its rows, and of rows that it replaces; where: its places in a lens.
+
+    radial: whether its rows along x and y are a radial error, whose magnitude the limit is.
+    """
 
     kinds: tuple[str, ...]
     where: Callable[[Parts], Sequence[tuple[int, ...]]]
     replaces: tuple[str, ...] = ()
+    radial: bool = False
 
 
 def _faces(parts: Parts) -> list[tuple[int, ...]]:
@@ -150,6 +156,7 @@ WORDS = {
     "element_decenter_z": Word(("element_decenter_z",), lambda parts: parts.units),
     "element_roll": Word(("element_roll",), lambda parts: parts.units),
 }
+WORDS |= {f"{name}_radial": word._replace(radial=True) for name, word in WORDS.items() if word.kinds[0][-2:] == "_x"}
 _LIMITS = re.compile(r"([a-z_]+)(?::([\d,-]+))?=(?:([^%]+?)\.\.)?([^%]+?)(%?)")
 
 
@@ -161,24 +168,30 @@ def tolerances(
     distribution: str = "normal",
     sigmas: float = 2.0,
     compensators: Sequence[Compensator] | None = None,
+    radial: bool = False,
 ) -> ToleranceTable:
     """The tolerances of every surface, element and gap of a lens: of a grade, of limits, or of its file.
 
     limits: "radius=0.1% thickness=0.02 element_tilt=0.05": words and kinds with their limits ± in mm, degrees, fringes
         or %, "irregularity:1,3=-0.2..0.5" for surfaces 1 and 3 alone, "index=0" for no such tolerance. They replace
-        those of the grade or the file.
+        those of the grade or the file. "element_decenter_radial=0.02" is the magnitude of an error along x and y, whose
+        direction is random.
     grade: "commercial", "precision" or "high": the figures of GRADES, each row with its source. None: the tolerances of
         the lens's own file.
-    distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "parabolic" or "end_points", of rows
-        that the file does not have.
+    distribution: "normal", truncated at `sigmas` standard deviations, "uniform", "disc", "parabolic" or "end_points",
+        of rows that the file does not have; of a radial error that of its magnitude: "disc" is uniform over the disc,
+        "end_points" over its circle.
     compensators: numbers adjusted after manufacture; by default those of the file for its own tolerances, of which
         there may be none, and the distance of the sensor for those of a grade or of limits alone.
+
+    radial: whether decentres, tilts and wedges of the grade and of limits are radial; by default those along x and y
+        are separate, each with the whole limit.
 
     A thickness of glass is taken up by the first gap of air behind it. Raises BadTolerance.
     """
     if grade is not None and grade not in GRADES:
         raise BadTolerance(f"grade {grade!r}{did_you_mean(grade, GRADES)}: expected one of {', '.join(GRADES)}")
-    words = _parsed(joined(limits))
+    words = parsed_limits(limits)
     stored = tolerances_of(lens) if grade is None else ToleranceTable(())
     if not (grade or words or stored.rows):
         limits_or_grade = f'{option("limits")}, as "radius=0.1%", or {option("grade")}, as "precision"'
@@ -186,13 +199,17 @@ def tolerances(
         raise BadTolerance(message)
     parts = parts_of(lens)
     drawn: dict[str, Any] = {"distribution": distribution, "sigmas": sigmas}
+    linked = {word: f"{word}_radial" for word in WORDS if radial and f"{word}_radial" in WORDS}
     rows = list(stored.rows)
     for word, figure in GRADES[grade].items() if grade else ():
+        word = linked.get(word, word)
         rows += _rows(lens, parts, _Limit(word, (), -figure.limit, figure.limit, figure.unit, figure.source), drawn)
     if grade:
         rows = _at_least_fringes(lens, rows, GRADES[grade]["radius"])
-    for limit in words:
-        rows = [row for row in rows if not _replaces(limit, row, parts)]
+    for limit in (limit._replace(word=linked.get(limit.word, limit.word)) for limit in words):
+        gone = [row for row in rows if replaces(limit, row, parts)]
+        broken = {row.group for row in gone if row.group}  # a radial error has both its components
+        rows = [row for row in rows if not (row in gone or row.group in broken)]
         if limit.minimum or limit.maximum:
             rows += _rows(lens, parts, limit, drawn)
     if compensators is None:
@@ -213,10 +230,10 @@ class _Limit(NamedTuple):
     source: str
 
 
-def _parsed(text: str) -> list[_Limit]:
-    """The limits of a text. Raises BadTolerance naming the word."""
-    limits = []
-    for piece in text.split():
+def parsed_limits(limits: str | Sequence[str]) -> list[_Limit]:
+    """The words of limits. Raises BadTolerance naming the word."""
+    parsed = []
+    for piece in joined(limits).split():
         match = _LIMITS.fullmatch(piece)
         if not match:
             raise BadTolerance(f"{piece!r}: expected a kind and its limit, as radius=0.1% or power:2-4=-1..3")
@@ -234,12 +251,14 @@ def _parsed(text: str) -> list[_Limit]:
             raise BadTolerance(str(error)) from error
         except ValueError:
             raise BadTolerance(f"{piece!r}: expected a number, or two as -1..3") from None
+        if low is not None and word in WORDS and WORDS[word].radial:
+            raise BadTolerance(f"{piece!r}: the limit of a radial error is its magnitude, as {word}=0.02")
         if not minimum <= maximum:
             raise BadTolerance(
                 f"{piece!r}: the limits {minimum:g} to {maximum:g}; expected a positive number, or -1..3"
             )
-        limits.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
-    return limits
+        parsed.append(_Limit(word, surfaces, minimum, maximum, percent, f"limits {piece}"))
+    return parsed
 
 
 def _word(name: str) -> Word:
@@ -250,7 +269,7 @@ def _word(name: str) -> Word:
     return Word((name,), _faces if whole is None else whole.where)
 
 
-def _replaces(limit: _Limit, row: Tolerance, parts: Parts) -> bool:
+def replaces(limit: _Limit, row: Tolerance, parts: Parts) -> bool:
     """Whether a limit takes the place of a row."""
     word = _word(limit.word)
     if row.kind not in (word.replaces or word.kinds):
@@ -279,7 +298,10 @@ def _rows(lens: Lens, parts: Parts, limit: _Limit, drawn: dict[str, Any]) -> lis
                 continue
             if kind == "abbe" and not has_abbe_number(lens.surfaces[place[0]].glass):
                 continue
-            row = Tolerance(kind, tuple(place), limit.minimum, limit.maximum, source=limit.source)
+            part = math.sqrt(0.5) if word.radial else 1.0
+            row = Tolerance(kind, tuple(place), part * limit.minimum, part * limit.maximum, source=limit.source)
+            if word.radial:
+                row = dataclasses.replace(row, group=f"{limit.word} of {row.where}")
             if kind == "irregularity_angle":
                 rows.append(dataclasses.replace(row, minimum=-90.0, maximum=90.0, distribution="uniform"))
                 continue

@@ -6,6 +6,7 @@ limits a and b, m their middle and h half their distance:
     normal       m + σ Φ⁻¹(p + u (1 - 2p)),  σ = h/sigmas,  p = Φ(-sigmas)
     uniform      a + u (b - a)
     parabolic    m + h ∛(2u - 1),  density 3 (e - m)²/(2h³)
+    disc         m ± h √|2u - 1|,  density |e - m|/h²
     end_points   a or b
     table        a + (b - a) x, x of a density that is linear between the points of a table
 
@@ -69,6 +70,8 @@ def _errors(row: Tolerance, u: np.ndarray) -> np.ndarray:
         return row.minimum + u * (row.maximum - row.minimum)
     if row.distribution == "parabolic":
         return middle + half * np.cbrt(2 * u - 1)
+    if row.distribution == "disc":
+        return middle + half * np.sign(2 * u - 1) * np.sqrt(np.abs(2 * u - 1))
     if row.distribution == "table":
         return row.minimum + 2 * half * _quantile(row.density, u)
     return np.where(u < 0.5, row.minimum, row.maximum)

@@ -311,7 +311,8 @@ def _moments(row: Tolerance) -> tuple[float, float]:
         s = row.sigmas
         density = math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi)
         return middle, (half / s) ** 2 * (1 - 2 * s * density / (2 * float(ndtr(s)) - 1))
-    return middle, half * half * {"uniform": 1 / 3, "parabolic": 3 / 5, "end_points": 1.0}[row.distribution]
+    shares = {"uniform": 1 / 3, "disc": 1 / 2, "parabolic": 3 / 5, "end_points": 1.0}
+    return middle, half * half * shares[row.distribution]
 
 
 def views_of(

@@ -3,9 +3,10 @@ the test."""
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +18,15 @@ from raytrace.words import RaytraceError
 
 class BadTolerance(RaytraceError, ValueError):
     """A tolerance that the lens does not have, or limits that no error meets."""
+
+
+class Radial(NamedTuple):
+    """A radial error: its rows along x and along y, its kind in words, and its largest magnitude, in their unit."""
+
+    places: tuple[int, int]
+    along: tuple[int, int]
+    name: str
+    magnitude: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,6 +82,30 @@ class ToleranceTable(Result):
         return [f"not read: {line}" for line in self.unread]
 
     @property
+    def radial(self) -> dict[int, Radial]:
+        """The radial errors by their first row."""
+        pairs = (places for places in groups_of(self.rows) if len(places) == 2)
+        return {places[0]: radial for places in pairs if (radial := _radial(self.rows, places)) is not None}
+
+    @property
+    def names(self) -> list[str]:
+        """Kind and place of every row in words; of the first row of a group those of all its rows."""
+        names = self.labels
+        for first, *_, last in (places for places in groups_of(self.rows) if len(places) > 1):
+            names[first] = f"{self.rows[first].name} … {names[last]}"
+        for first, radial in self.radial.items():
+            names[first] = f"{radial.name} of {self.rows[first].where}"
+        return names
+
+    @property
+    def ranges(self) -> tuple[Tensor, Tensor]:
+        """Limits (N,), (N,) of every row; of the first row of a radial error -R and R of its magnitude."""
+        low, high = self.minimum, self.maximum
+        for first, radial in self.radial.items():
+            low[first], high[first] = -radial.magnitude, radial.magnitude
+        return low, high
+
+    @property
     def leaders(self) -> Tensor:
         """The first row (N,) of the group of every row; of one without a group, itself."""
         leaders = torch.arange(len(self.rows))
@@ -89,24 +123,28 @@ class ToleranceTable(Result):
         return dataclasses.replace(self, rows=tuple(row for row in self.rows if row.kind in kinds), saves=())
 
     def columns(self) -> dict[str, Tensor]:
-        """Number of each row, from 1, kind and place, limits and distribution."""
-        count = len(self.rows)
-        ends = torch.arange(count)
+        """Number of each row, from 1, kind and place, limits and distribution; a radial error is one line."""
+        hidden = {radial.places[1] for radial in self.radial.values()}
+        shown = torch.tensor([n for n in range(len(self.rows)) if n not in hidden], dtype=torch.int64)
+        low, high = self.ranges
+        sigmas = torch.tensor([row.sigmas if row.distribution == "normal" else torch.nan for row in self.rows])
         return {
-            "row": ends + 1,
-            "tolerance": ends,
-            "minimum": self.minimum,
-            "maximum": self.maximum,
-            "unit": ends,
-            "distribution": ends,
-            "sigmas": torch.tensor([row.sigmas if row.distribution == "normal" else torch.nan for row in self.rows]),
-            "source": ends,
+            "row": shown + 1,
+            "tolerance": shown,
+            "minimum": low[shown],
+            "maximum": high[shown],
+            "unit": shown,
+            "distribution": shown,
+            "sigmas": sigmas[shown],
+            "source": shown,
         }
 
     def words(self) -> dict[str, Sequence[str]]:
-        notes = [self._note(row) for row in self.rows]
+        notes, names = [self._note(row) for row in self.rows], self.labels
+        for first in self.radial:
+            names[first] = self.names[first]
         return {
-            "tolerance": [f"{label}{note}" for label, note in zip(self.labels, notes, strict=True)],
+            "tolerance": [f"{label}{note}" for label, note in zip(names, notes, strict=True)],
             "unit": [row.unit for row in self.rows],
             "distribution": [row.distribution for row in self.rows],
             "source": [row.source for row in self.rows],
@@ -119,7 +157,8 @@ class ToleranceTable(Result):
         return f", pivot {row.pivot:g} mm" if row.pivot else ""
 
     def tables(self) -> Sequence[Table]:
-        title = [f"{len(self.rows)} tolerances, fringes at {self.test_wavelength:g} µm"]
+        count = len(self.rows) - len(self.radial)
+        title = [f"{count} tolerances, fringes at {self.test_wavelength:g} µm"]
         notes = [f"compensator: {compensator}" for compensator in self.compensators]
         return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
 
@@ -145,6 +184,17 @@ def groups_of(rows: Sequence[Tolerance]) -> list[list[int]]:
     for place, row in enumerate(rows):
         groups.setdefault(row.group or place, []).append(place)
     return list(groups.values())
+
+
+def _radial(rows: Sequence[Tolerance], places: Sequence[int]) -> Radial | None:
+    """The radial error of two rows of a group; None where they are not along x and y of the same surfaces."""
+    first, second = (rows[place] for place in places)
+    axes = {row.kind[-2:]: place for row, place in zip((first, second), places, strict=True)}
+    name = first.kind[:-2]
+    if name != second.kind[:-2] or axes.keys() != {"_x", "_y"} or first.surfaces != second.surfaces:
+        return None
+    largest = max(abs(limit) for row in (first, second) for limit in (row.minimum, row.maximum))
+    return Radial((places[0], places[1]), (axes["_x"], axes["_y"]), f"{name}_radial", math.sqrt(2) * largest)
 
 
 def rows_of(tolerances: ToleranceTable | Iterable[Tolerance]) -> tuple[Tolerance, ...]:

@@ -7,7 +7,8 @@
 
 A of 3/ is the sagitta error (power), B the irregularity, C the irregularity of revolution. A fringe is half a
 wavelength: N fringes at λ are N λ/546.07 nm here. 4/ is the largest tilt of a face: that of its tolerances, of a runout
-e over the diameter 2h the angle arctan(e/2h), of a decentre d the angle d |c|. A dash: the lens has no such tolerance.
+e over the diameter 2h the angle arctan(e/2h), of a decentre d the angle d |c|; of a radial error that of its magnitude.
+A dash: the lens has no such tolerance.
 """
 
 import math
@@ -64,6 +65,7 @@ class Indications:
 
     def __init__(self, table: ToleranceTable, words: Mapping[str, str], coating: str = "") -> None:
         self.rows, self.words, self.coating = table.rows, words, coating
+        self.radial = {(error.name, table[first].surfaces): error.magnitude for first, error in table.radial.items()}
         self.fringe = table.test_wavelength / WAVELENGTH
 
     def row(self, kind: str, *surfaces: int) -> Tolerance | None:
@@ -93,13 +95,18 @@ class Indications:
 
     def tilt(self, face: Face) -> float:
         """Degrees by which the tolerances of a face tilt it at most; nan without one."""
-        k, angles = face.number, []
-        for axis in "xy":
-            tilt, runout, shift = (self.row(f"surface_{kind}_{axis}", k) for kind in ("tilt", "runout", "decenter"))
-            angles += [] if tilt is None else [_largest(tilt)]
-            angles += [] if runout is None else [math.degrees(math.atan(_largest(runout) / (2 * face.clear)))]
-            angles += [] if shift is None else [math.degrees(math.atan(_largest(shift) * abs(face.curvature)))]
+        tilt, runout, shift = (self.largest(f"surface_{kind}", face.number) for kind in ("tilt", "runout", "decenter"))
+        angles = [] if tilt is None else [tilt]
+        angles += [] if runout is None else [math.degrees(math.atan(runout / (2 * face.clear)))]
+        angles += [] if shift is None else [math.degrees(math.atan(shift * abs(face.curvature)))]
         return max(angles, default=math.nan)
+
+    def largest(self, kind: str, *surfaces: int) -> float | None:
+        """The magnitude of a radial error at surfaces, or the largest one along x or y; None without a tolerance."""
+        if (magnitude := self.radial.get((f"{kind}_radial", surfaces))) is not None:
+            return magnitude
+        rows = (self.row(f"{kind}_{axis}", *surfaces) for axis in "xy")
+        return max((_largest(row) for row in rows if row is not None), default=None)
 
     def centring(self, face: Face) -> str:
         """4/σ in minutes, or in seconds of arc below one minute."""
@@ -113,9 +120,12 @@ class Indications:
 
     def mounting(self, first: int, last: int) -> tuple[str, str]:
         """Decentre in mm and tilt in minutes of arc of an element or a group in its mount; "–" without one."""
-        shift, tilt = (self.row(f"element_{kind}_x", first, last) or self.row(f"element_{kind}_y", first, last)
-                       for kind in ("decenter", "tilt"))  # fmt: skip
-        return limits(shift) or "–", limits(tilt, 60, "′", 2) or "–"
+        kinds = [f"element_{kind}" for kind in ("decenter", "tilt")]
+        radial = [self.radial.get((f"{kind}_radial", (first, last))) for kind in kinds]
+        rows = [self.row(f"{kind}_x", first, last) or self.row(f"{kind}_y", first, last) for kind in kinds]
+        shift = limits(rows[0]) if radial[0] is None else f"{radial[0]:.3g} radial"
+        tilt = limits(rows[1], 60, "′", 2) if radial[1] is None else f"{60 * radial[1]:.2g}′ radial"
+        return shift or "–", tilt or "–"
 
     def others(self, part: Part) -> list[str]:
         """Tolerances of a part that have no place in the table, in words."""
