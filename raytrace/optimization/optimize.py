@@ -178,13 +178,18 @@ def optimize(
     def lens_at(x: np.ndarray) -> Lens:
         return _lens_at(problem.model, x, data, bounded)
 
+    def ended(x: np.ndarray, history: Sequence[Cycle], after: Evaluated, **more: Any) -> Optimized:
+        """The result at variables x (n,), with its warnings; more: further fields."""
+        results = _attained(problem, after, x, lower=lower, upper=upper)
+        seconds = time.monotonic() - started
+        end, model = lens_at(x), problem.model
+        return _warned(_optimized(lens, end, model, x, history, conditions=results, seconds=seconds, **more))
+
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
     if loss is not None:
         measured = Loss.of(loss, quantity, object_distances, check_rings)
-        descents = LossDescents(
-            problem, measured, lower=lower, upper=upper, typical=typical, evaluated=resumed.evaluated
-        )  # fmt: skip
+        descents = LossDescents(problem, measured, (lower, upper), resumed.evaluated)
         with observer(dependencies, lens_at) as seen:
 
             def each(cycle: Cycle, x: np.ndarray) -> None:
@@ -197,14 +202,10 @@ def optimize(
             seen.write(
                 reached.x, reached.report.end, len(reached.history), evaluated=descents.function.evaluated, now=True
             )  # fmt: skip
-        end = lens_at(reached.x)
-        result = _optimized(
-            lens, end, model, reached.x, reached.history, merits=(reached.report.start, reached.report.end),
-            cycles=reached.cycles, evaluations=reached.evaluations, stopped=reached.stopped,
-            seconds=time.monotonic() - started, loss=reached.report,
-            conditions=_attained(problem, problem.evaluated(reached.x), reached.x, lower=lower, upper=upper),
+        return ended(
+            reached.x, reached.history, problem.evaluated(reached.x), cycles=reached.cycles, stopped=reached.stopped,
+            merits=(reached.report.start, reached.report.end), evaluations=reached.evaluations, loss=reached.report,
         )  # fmt: skip
-        return _warned(result)
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
     seconds_of_end = time.monotonic() - evaluating
@@ -235,20 +236,17 @@ def optimize(
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
     x, count = descent.state.x, len(problem.rows)
     after = problem.evaluated(x)
-    results = _attained(problem, after, x, lower=lower, upper=upper)
-    end = lens_at(x)
-    result = _optimized(
-        lens, end, problem.model, x, descent.history, rows=problem.rows,
+    return ended(
+        x, descent.history, after, rows=problem.rows,
         merits=(problem.merit(before, model.start), problem.merit(after, x)),
         values=(before.values[:count], after.values[:count]),
         contributions=(before.contributions(np.arange(count)), after.contributions(np.arange(count))),
         cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0),
         evaluations=descent.evaluations + (choice.evaluations if choice else 0),
-        stopped="interrupted" if opening.interrupted else descent.stopped, seconds=time.monotonic() - started,
-        glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing, conditions=results,
-        as_built=None if term is None else AsBuiltChange.of(term, lens, end),
+        stopped="interrupted" if opening.interrupted else descent.stopped,
+        glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing,
+        as_built=None if term is None else AsBuiltChange.of(term, lens, lens_at(x)),
     )  # fmt: skip
-    return _warned(result)
 
 
 def _attained(
