@@ -1,6 +1,7 @@
 """Losses by lifted least squares: the solver, quantities, conditions, checks by denser rays, restarts."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -120,19 +121,15 @@ def test_restarts_end_at_the_best_descent_and_repeat():
     assert first.loss.end == min(first.loss.ends)
 
 
-def interrupts(*arguments, **settings):
-    raise KeyboardInterrupt
-
-
 def test_an_interrupt_between_descents_keeps_the_best_lens(monkeypatch):
     options = {**FEW, "restarts": 1, "cycles": 150, "loss": low_contrast, "of": TRANSFER}
     whole = rt.optimize(TRIPLET, **options)
     with monkeypatch.context() as patched:
-        patched.setattr(Lifted, "displaced", interrupts)
+        patched.setattr(Lifted, "displaced", Mock(side_effect=KeyboardInterrupt))
         before_restarts = rt.optimize(TRIPLET, **options)
     assert (before_restarts.stopped, before_restarts.loss.ends) == ("interrupted", whole.loss.ends[:1])
     with monkeypatch.context() as patched:
-        patched.setattr(Otf, "denser", interrupts)
+        patched.setattr(Otf, "denser", Mock(side_effect=KeyboardInterrupt))
         before_check = rt.optimize(TRIPLET, **options)
     assert (before_check.stopped, before_check.loss.ends) == ("interrupted", whole.loss.ends)
     assert before_check.loss.end == min(whole.loss.ends)

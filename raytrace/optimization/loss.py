@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -142,7 +142,7 @@ class LossDescents:
     ):
         self.problem, self.loss = problem, loss
         self.function = FunctionMerit(problem.model, loss, evaluated)
-        self.settings = {"lower": ends[0], "upper": ends[1], "typical": typical_of(problem.model)}
+        self.settings: dict[str, Any] = {"lower": ends[0], "upper": ends[1], "typical": typical_of(problem.model)}
         self.history: list[Cycle] = []
         self.cycle_limit, self.deadline, self.stopped = 0, np.inf, ""
 
