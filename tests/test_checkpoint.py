@@ -21,7 +21,7 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.optimization import checkpoint, least_squares
 from raytrace.optimization.checkpoint import BadCheckpoint
 from raytrace.optimization.least_squares import Sides, SumOfSquares, best_of_paths
-from raytrace.optimization.lifted import Lifted, descend
+from raytrace.optimization.lifted import Lifted
 
 TRIPLET = read_lens("cooke_triplet")
 SPOT = {"merit": "spot", "vary": "curvature sensor", "cycles": 8}
@@ -247,7 +247,8 @@ def test_no_step_begins_that_would_not_end_in_time(seconds, monkeypatch):
     assert clock.now - 100.0 >= seconds - 13  # nor does it end long before
     assert found.cycles == len(found.history)
     clock.now = 100.0
-    descend(Lifted(clock, clock.state, np.ones(2)), np.array([-1.2, 1.0]), cycles=1000, until=100.0 + seconds, **FREE)
+    lifted = Lifted(clock, clock.state, typical=np.ones(2), **FREE)
+    lifted.descend(np.array([-1.2, 1.0]), cycles=1000, until=100.0 + seconds)
     assert clock.now - 100.0 <= max(seconds, 30.0 + 21.0)  # the first evaluations with derivatives and without
 
 

@@ -131,3 +131,22 @@ def test_the_gradient_that_steps_take_is_that_of_the_loss():
         unit = change * np.eye(len(x))[k]
         ahead, behind = steps._function(x + unit)[0], steps._function(x - unit)[0]
         assert gradient[k] == pytest.approx((ahead - behind) / (2 * change), rel=1e-4)
+
+
+def test_an_interrupt_leaves_the_best_lens_and_ends_the_run():
+    own = camera("curvature:1,2 sensor")
+    values, steps = [], LensSteps(own.variables)
+
+    def interrupted():
+        if len(values) == 6:
+            values.append(None)
+            raise KeyboardInterrupt
+        error = camera_error(own, SPECTRUM, even_distances(own, 2))
+        values.append(float(error.detach()))
+        return error
+
+    before = own.variables.numbers()
+    with pytest.raises(KeyboardInterrupt):
+        steps.minimise(interrupted)
+    assert own.variables.numbers() != before
+    assert float(camera_error(own, SPECTRUM, even_distances(own, 2))) == min(values[:6]) < values[0]

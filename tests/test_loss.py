@@ -1,5 +1,8 @@
 """Losses by lifted least squares: the solver, quantities, conditions, checks by denser rays, restarts."""
 
+import dataclasses
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +10,7 @@ import torch
 import raytrace as rt
 from raytrace.io import read_lens
 from raytrace.optimization.least_squares import Sides, SumOfSquares
-from raytrace.optimization.lifted import Lifted, descend
+from raytrace.optimization.lifted import Lifted
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.quantities import Kernels, Otf, Points
 
@@ -27,7 +30,7 @@ def low_contrast(otf):
 # -- the solver
 
 
-FREE = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf), "cycles": 100}
+FREE = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf), "typical": np.ones(2)}
 
 
 def valley(x):
@@ -50,7 +53,7 @@ def test_a_narrow_valley_is_followed_to_its_end():
         evaluations.append(x)
         return valley(x)
 
-    end = descend(Lifted(counted, rows, np.ones(2)), np.array([-1.2, 1.0]), **FREE)
+    end = Lifted(counted, rows, **FREE).descend(np.array([-1.2, 1.0]), cycles=100)
     assert end.state.x == pytest.approx([1.0, 1.0], abs=1e-5)
     assert end.state.merit < 1e-10
     assert len(evaluations) < 200
@@ -62,9 +65,8 @@ def test_an_equality_that_is_curved_is_met_at_the_minimum():
     def circle(x):
         return np.array([x @ x - 1.0]), 2 * x[None, :]
 
-    end = descend(
-        Lifted(valley, lambda x, derivatives: rows(x, derivatives, circle), np.ones(2)), np.array([0.1, 0.9]), **FREE
-    )
+    lifted = Lifted(valley, lambda x, derivatives: rows(x, derivatives, circle), **FREE)
+    end = lifted.descend(np.array([0.1, 0.9]), cycles=100)
     assert end.state.x == pytest.approx([0.78641515, 0.61769831], abs=1e-6)
     assert abs(end.state.held[0]) < 1e-9
 
@@ -117,6 +119,46 @@ def test_restarts_end_at_the_best_descent_and_repeat():
     first, second = (rt.optimize(TRIPLET, loss=low_contrast, of=TRANSFER, **options) for _ in range(2))
     assert torch.equal(first.variables_after, second.variables_after)
     assert first.loss.end == min(first.loss.ends)
+
+
+def test_an_interrupt_between_descents_keeps_the_best_lens(monkeypatch):
+    options = {**FEW, "restarts": 1, "cycles": 150, "loss": low_contrast, "of": TRANSFER}
+    whole = rt.optimize(TRIPLET, **options)
+    with monkeypatch.context() as patched:
+        patched.setattr(Lifted, "displaced", Mock(side_effect=KeyboardInterrupt))
+        before_restarts = rt.optimize(TRIPLET, **options)
+    assert (before_restarts.stopped, before_restarts.loss.ends) == ("interrupted", whole.loss.ends[:1])
+    with monkeypatch.context() as patched:
+        patched.setattr(Otf, "denser", Mock(side_effect=KeyboardInterrupt))
+        before_check = rt.optimize(TRIPLET, **options)
+    assert (before_check.stopped, before_check.loss.ends) == ("interrupted", whole.loss.ends)
+    assert before_check.loss.end == min(whole.loss.ends)
+
+
+def test_an_interrupt_within_a_descent_is_followed_by_no_other(monkeypatch):
+    options = {**FEW, "restarts": 2, "cycles": 300, "loss": low_contrast, "of": TRANSFER}
+    numbers = []
+
+    def stop_in_second(cycle, lens):
+        numbers.append(cycle.merit)
+        if len(numbers) > 1 and numbers[-1] > numbers[-2]:  # the first cycle from a displaced lens, worse than the best
+            raise KeyboardInterrupt
+
+    found = rt.optimize(TRIPLET, **options, watch=stop_in_second)
+    assert (found.stopped, len(found.loss.ends)) == ("interrupted", 2)
+    assert found.loss.end == found.loss.ends[0] < found.loss.ends[1]
+
+    minimise_rows = Lifted.minimise_rows
+    pre_optimised = []
+
+    def stopped(self, x, **settings):
+        pre_optimised.append(dataclasses.replace(minimise_rows(self, x, **settings), stopped="interrupted"))
+        return pre_optimised[0]
+
+    monkeypatch.setattr(Lifted, "minimise_rows", stopped)
+    found = rt.optimize(TRIPLET, **options)
+    assert (found.stopped, len(found.history)) == ("interrupted", 0)
+    assert found.variables_after.tolist() == pre_optimised[0].state.x.tolist()
 
 
 def test_boundaries_of_the_first_rows_are_met_exactly():

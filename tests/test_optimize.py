@@ -133,6 +133,17 @@ def test_an_interrupt_keeps_the_best():
     assert end.state.cost < rosenbrock(np.array([-1.2, 1.0])) @ rosenbrock(np.array([-1.2, 1.0]))
 
 
+def test_an_interrupt_before_the_first_cycle_keeps_the_start():
+    def evaluate(x, derivatives):
+        if derivatives:
+            raise KeyboardInterrupt
+        return squares(rosenbrock, by_rosenbrock)(x, False)
+
+    start = np.array([-1.2, 1.0])
+    end = least_squares(evaluate, start, lower=np.full(2, -FAR), upper=np.full(2, FAR))
+    assert (end.stopped, end.state.x.tolist()) == ("interrupted", start.tolist())
+
+
 # -- lenses ------------------------------------------------------------------------------------------------------------
 
 

@@ -388,6 +388,28 @@ def test_minima_of_the_merit_are_followed_to_minima_of_a_loss(tmp_path):
         rt.search(triplet, loss=mean_distance, as_built=rt.tolerancing.AsBuilt(grade="precision"), **how)
 
 
+def steep(points):
+    return (1e3 * mean_distance(points)) ** 6
+
+
+def test_lenses_without_an_element_are_followed_to_minima_of_a_loss(tmp_path):
+    """Those whose loss is more than twice that of the best one are left out."""
+    triplet = rt.read_lens("cooke_triplet").at(wavelengths=[0.5876], fields=[0, 4], f_number=12)
+    how = {"merit": "spot", "vary": "curvature sensor", "hold": "efl", "bounds": "sensor:20..140", "delete": True}
+    quantity, denser = rt.optimization.Points(4), rt.optimization.Points(8)
+    of_spots = rt.search(triplet, **how)
+    of_loss = rt.search(triplet, loss=steep, of=quantity, folder=tmp_path, **how)
+    before = [float(steep(quantity(lens))) for lens in of_spots.lenses]
+    assert (of_loss.stopped, len(of_loss.lenses)) == ("surfaces", sum(loss <= 2 * min(before) for loss in before))
+    assert 0 < len(of_loss.lenses) < len(of_spots.lenses)
+    assert {len(lens.surfaces) for lens in of_loss.lenses} == {len(triplet.surfaces) - 2}
+    by_denser = [float(steep(denser(lens))) for lens in of_loss.lenses]
+    assert of_loss.loss.tolist() == pytest.approx(by_denser, rel=0.02)
+    assert of_loss.loss[0] < 0.999 * min(float(steep(denser(lens))) for lens in of_spots.lenses)
+    again = rt.search(triplet, loss=steep, of=quantity, folder=tmp_path, **how)
+    assert torch.equal(again.variables, of_loss.variables)
+
+
 # -- a curriculum ------------------------------------------------------------------------------------------------------
 
 

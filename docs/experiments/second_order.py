@@ -28,7 +28,7 @@ from torch import Tensor
 
 import raytrace as rt
 from raytrace.optimization.least_squares import Cycle, CycleStart, least_squares
-from raytrace.optimization.lifted import Lifted, descend
+from raytrace.optimization.lifted import Lifted
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import FunctionMerit, Problem, typical_of
 from raytrace.optimization.quantities import Points
@@ -155,12 +155,15 @@ class Case:
     def at_spots(self, x: np.ndarray) -> np.ndarray:
         return least_squares(self.problem.state, x, typical=self.typical, cycles=100, **self.ends).state.x
 
+    def lifted(self) -> Lifted:
+        return Lifted(self.function, self.problem.state, typical=self.typical, **self.ends)
+
     def checked(self, x: np.ndarray) -> float:
         return FunctionMerit(self.model, self.losses[1])(x)[0]
 
 
 def lm(case: Case, x: np.ndarray) -> np.ndarray:
-    return descend(Lifted(case.function, case.problem.state, case.typical), x, cycles=300, **case.ends).state.x
+    return case.lifted().descend(x, cycles=300).state.x
 
 
 def units(case: Case, x: np.ndarray) -> np.ndarray:
@@ -307,7 +310,7 @@ def pace(name: str) -> None:
 
         seconds = np.inf
         try:
-            descend(Lifted(case.function, case.problem.state, case.typical), x, cycles=300, watch=watch, **case.ends)
+            case.lifted().descend(x, cycles=300, watch=watch)
         except Passed:
             seconds = time.process_time() - started - checks
         ratios.append((float(row["seconds"]) - spots) / (seconds - spots))

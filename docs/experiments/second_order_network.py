@@ -47,6 +47,23 @@ COLUMNS = (
 )
 
 
+def transfer_of(points: Tensor, pixel: float, size: int) -> Tensor:
+    """Transfer functions (D, F, size, size), as by `fft2`, of landing points (2, D, F, W, P) about the centroid of all
+    colours; pixel: mm."""
+    about = (points - points.mean((-2, -1), keepdim=True)) / pixel
+    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
+    columns, rows = (
+        torch.polar(torch.ones(()).double(), -2 * np.pi * part.flatten(-2)[..., None] * frequency) for part in about
+    )
+    of_pixel = torch.sinc(frequency)
+    return torch.einsum("dfpu,dfpv->dfuv", rows, columns) / rows.shape[-2] * of_pixel[:, None] * of_pixel
+
+
+def kernels_of(transfer: Tensor) -> Tensor:
+    """PSFs (..., size, size), their centroid in the middle, of energy 1."""
+    return torch.fft.fftshift(torch.fft.ifft2(transfer).real, (-2, -1))
+
+
 class Case:
     """A lens at the best spots of a displaced start, its PSFs and its pictures."""
 
@@ -71,15 +88,7 @@ class Case:
     def kernels(self, rings: int = RINGS) -> Tensor:
         """PSFs (D, F, rows, columns) on pixels about the centroid of all colours, of energy 1."""
         points = Points(rings)(self.variables(), self.distances)
-        about = (points - points.mean((-2, -1), keepdim=True)) / self.design.pixel
-        frequency = torch.fft.fftfreq(WINDOW, dtype=torch.float64)
-        columns, rows = (
-            torch.polar(torch.ones(()).double(), -2 * np.pi * part.flatten(-2)[..., None] * frequency) for part in about
-        )
-        transfer = torch.einsum("dfpu,dfpv->dfuv", rows, columns) / rows.shape[-2]
-        pixel = torch.sinc(frequency)
-        kernels = torch.fft.ifft2(transfer * pixel[:, None] * pixel).real
-        return torch.fft.fftshift(kernels, (-2, -1))
+        return kernels_of(transfer_of(points, self.design.pixel, WINDOW))
 
     def closed_form(self) -> Tensor:
         return kernel_error(self.kernels(), self.spectrum, second_order.NOISE).mean()

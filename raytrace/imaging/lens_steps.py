@@ -4,7 +4,6 @@ The loss is lifted into the rays of the lens (`optimization.lifted`): a step is 
 metric of the RMS blur, within the bounds and under the conditions of the variables, which it meets exactly.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 
@@ -14,8 +13,8 @@ from torch import Tensor
 
 from raytrace.imaging.constraints import with_limits
 from raytrace.imaging.variables import Variables
-from raytrace.optimization.least_squares import Slope, SumOfSquares, TensorDescent, least_squares
-from raytrace.optimization.lifted import OPTIONS, Lifted, descend
+from raytrace.optimization.least_squares import Descent, Slope, SumOfSquares, TensorDescent
+from raytrace.optimization.lifted import OPTIONS, Lifted
 from raytrace.optimization.merit import DefaultMerit
 from raytrace.optimization.problem import Problem, typical_of
 from raytrace.tracing.compiled import prepare
@@ -24,7 +23,7 @@ from raytrace.tracing.compiled import prepare
 class LensSteps:
     """Steps of the parameters of `Variables`; those that need no gradient do not move.
 
-    memory: of earlier steps, which are resumed.
+    A KeyboardInterrupt leaves the parameters at the best lens so far. memory: of earlier steps, which are resumed.
     """
 
     def __init__(self, variables: Variables, memory: dict | None = None):
@@ -32,11 +31,11 @@ class LensSteps:
         self.variables, self.damping = variables, OPTIONS.damping
         rows = DefaultMerit("spot").rows(variables.free.lens)
         self.problem = Problem(variables.free, rows, variables.held_to)
-        self.typical = typical_of(variables.free)
         self._values: list[float] = []
         self._loss: Callable[[], Tensor] = lambda: torch.zeros(())
         self._last: tuple[bytes, Slope] | None = None
-        self.lifted = Lifted(self._function, self._rows, self.typical)
+        lower, upper = self._ends()
+        self.lifted = Lifted(self._function, self._rows, lower=lower, upper=upper, typical=typical_of(variables.free))
         if memory is not None:
             self.damping = memory["damping"]
             self.lifted.resume(memory)
@@ -56,38 +55,38 @@ class LensSteps:
         of the gradient within a call.
         """
         self._begin(loss)
-        lower, upper = self._ends()
-        descent = least_squares(
-            self.lifted.state, self._numbers(), lower=lower, upper=upper, typical=self.typical, cycles=1,
-            options=dataclasses.replace(OPTIONS, damping=self.damping),
-        )  # fmt: skip
+        descent = self.lifted.step(self._numbers(), self.damping)
         self.damping = descent.cycles[-1].damping if descent.cycles else OPTIONS.damping
-        self._put(descent.state.x)
+        self._end(descent)
         return self._values[0]
 
     def minimise_spots(self, *, cycles: int = 100) -> None:
         """Move to the smallest spots of the lens's own fields, wavelengths and object distance."""
-        lower, upper = self._ends()
-        descent = least_squares(
-            self._rows, self._numbers(), lower=lower, upper=upper, typical=self.typical, cycles=cycles
-        )
-        self._put(descent.state.x)
+        self.lifted.lower, self.lifted.upper = self._ends()
+        self._end(self.lifted.minimise_rows(self._numbers(), cycles=cycles))
 
     def minimise(self, loss: Callable[[], Tensor], *, cycles: int = 300) -> TensorDescent:
         """Descend to the minimum of a loss, a function without arguments of the current lens."""
         self._begin(loss)
-        start, (lower, upper) = self._numbers(), self._ends()
+        start = self._numbers()
         is_flat = not self._function(start)[1].any()
-        descent = descend(self.lifted, start, lower=lower, upper=upper, cycles=0 if is_flat else cycles)
+        descent = self.lifted.descend(start, cycles=0 if is_flat else cycles)
+        self._end(descent)
         x, gradient = descent.state.x, self._function(descent.state.x)[1]
-        self._put(x)
-        reached = np.where(gradient > 0, lower, upper)
+        reached = np.where(gradient > 0, self.lifted.lower, self.lifted.upper)
         at_end = (gradient != 0) & np.isclose(x, reached, rtol=1e-9, atol=1e-9)
         return TensorDescent((*self._values, descent.state.cost), tuple(at_end.tolist()), is_flat)
 
     def _begin(self, loss: Callable[[], Tensor]) -> None:
         self._loss, self._last = loss, None
+        self.lifted.lower, self.lifted.upper = self._ends()
         self._values.clear()
+
+    def _end(self, descent: Descent) -> None:
+        """Move to the end of a descent; a KeyboardInterrupt that ended it is raised again."""
+        self._put(descent.state.x)
+        if descent.stopped == "interrupted":
+            raise KeyboardInterrupt
 
     @torch.no_grad()
     def _numbers(self) -> np.ndarray:

@@ -439,6 +439,8 @@ class _LeastSquares:
             self.evaluations -= resume is not None  # it was counted before
         except _OutOfTime:
             return Descent(self.evaluate(x, False), "seconds", tuple(self.cycles), self.evaluations)
+        except KeyboardInterrupt:
+            return Descent(self.evaluate(x, False), "interrupted", tuple(self.cycles), self.evaluations)
         stopped = self._idle() if resume is not None and len(self.cycles) < cycles else ""
         try:
             while not stopped:

@@ -22,6 +22,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -30,6 +31,7 @@ from raytrace.optimization.least_squares import (
     Cycle,
     CycleStart,
     Descent,
+    Evaluate,
     Sides,
     Slope,
     SolverOptions,
@@ -81,19 +83,23 @@ class _Place:
 
 
 class Lifted:
-    """A loss of n variables; `state` is the function of `least_squares`.
+    """A loss of n variables within bounds, and its descents; `state` is the function of `least_squares`.
 
     function: x (n,) -> loss and gradient (n,); rows: the state of a merit function of rays, whose residuals are the
-    metric, with the conditions; its boundaries are met exactly. typical: as for `least_squares`.
+    metric, with the conditions; its boundaries are met exactly. lower, upper, typical: as for `least_squares`.
     """
 
     def __init__(
         self,
         function: Callable[[np.ndarray], Slope],
         rows: Callable[[np.ndarray, bool], SumOfSquares],
+        *,
+        lower: np.ndarray,
+        upper: np.ndarray,
         typical: np.ndarray,
     ):
-        self.function, self.rows, self.typical = function, rows, typical
+        self.function, self.rows = function, rows
+        self.lower, self.upper, self.typical = lower, upper, typical
         self.places: deque[_Place] = deque(maxlen=_PAIRS + 1)
         self.scale: float | None = None
 
@@ -183,56 +189,63 @@ class Lifted:
             self.places.append(_Place(np.array(x), np.array(gradient), np.array(slope).reshape(-1, len(x))))
 
     def displaced(self, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Variables from x in a random direction, as far as makes a blur of the RMS spot."""
+        """Variables from x in a random direction, as far as makes a blur of 0.4 of the RMS spot, within the bounds."""
         blur, spot = self._metric(self.rows(x, True))
         direction = random.standard_normal(len(x))
         step = scipy.linalg.solve_triangular(blur, direction)
-        return x + _JUMP * spot / float(np.linalg.norm(direction)) * step
+        return np.clip(x + _JUMP * spot / float(np.linalg.norm(direction)) * step, self.lower, self.upper)
+
+    def minimise_rows(self, x: np.ndarray, *, cycles: int = 100, until: float = np.inf) -> Descent:
+        """Descend from x to the minimum of the rows."""
+        return self._least_squares(self.rows, x, cycles=cycles, until=until)
+
+    def step(self, x: np.ndarray, damping: float) -> Descent:
+        """One cycle from x, with the pairs of the cycles before."""
+        return self._least_squares(self.state, x, options=dataclasses.replace(OPTIONS, damping=damping), cycles=1)
+
+    def descend(
+        self,
+        x: np.ndarray,
+        *,
+        cycles: int,
+        until: float = np.inf,
+        watch: Callable[[Cycle, CycleStart], None] | None = None,
+    ) -> Descent:
+        """Descend from x: again and again without pairs, until that lowers the loss by nearly nothing.
+
+        cycles, until: as for `least_squares`; watch: invoked after each cycle.
+        """
+        history: tuple[Cycle, ...] = ()
+        evaluations, started, before = 0, time.monotonic(), np.inf
+        while True:
+            self.forget()
+            offset = len(history), evaluations, time.monotonic() - started
+
+            def counted(cycle: Cycle, offset: tuple[int, int, float] = offset) -> Cycle:
+                number, evaluated, seconds = offset
+                return dataclasses.replace(
+                    cycle, number=cycle.number + number, evaluations=cycle.evaluations + evaluated,
+                    seconds=cycle.seconds + seconds,
+                )  # fmt: skip
+
+            def each(cycle: Cycle, start: CycleStart, counted: Callable[[Cycle], Cycle] = counted) -> None:
+                if watch is not None:
+                    watch(counted(cycle), start)
+
+            descent = self._least_squares(
+                self.state, x, options=OPTIONS, cycles=cycles - len(history), until=until, watch=each
+            )
+            history, evaluations = (*history, *map(counted, descent.cycles)), evaluations + descent.evaluations
+            x, end = descent.state.x, descent.state.cost
+            ended = descent.stopped in ("gradient", "cycles", "seconds", "interrupted")
+            if ended or before - end <= _AGAIN * abs(end):
+                return dataclasses.replace(descent, cycles=history, evaluations=evaluations)
+            before = end
+
+    def _least_squares(self, evaluate: Evaluate, x: np.ndarray, **settings: Any) -> Descent:
+        return least_squares(evaluate, x, lower=self.lower, upper=self.upper, typical=self.typical, **settings)
 
 
 def _solved(blur: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """U⁻ᵀ g: a gradient by steps U p."""
     return scipy.linalg.solve_triangular(blur, gradient, trans="T")
-
-
-def descend(
-    lifted: Lifted,
-    x: np.ndarray,
-    *,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    cycles: int,
-    until: float = np.inf,
-    watch: Callable[[Cycle, CycleStart], None] | None = None,
-) -> Descent:
-    """Descend from x within the bounds: again and again without pairs, until that lowers the loss by nearly nothing.
-
-    cycles, until: as for `least_squares`; watch: invoked after each cycle.
-    """
-    history: tuple[Cycle, ...] = ()
-    evaluations, started, before = 0, time.monotonic(), np.inf
-    while True:
-        lifted.forget()
-        offset = len(history), evaluations, time.monotonic() - started
-
-        def counted(cycle: Cycle, offset: tuple[int, int, float] = offset) -> Cycle:
-            number, evaluated, seconds = offset
-            return dataclasses.replace(
-                cycle, number=cycle.number + number, evaluations=cycle.evaluations + evaluated,
-                seconds=cycle.seconds + seconds,
-            )  # fmt: skip
-
-        def each(cycle: Cycle, start: CycleStart, counted: Callable[[Cycle], Cycle] = counted) -> None:
-            if watch is not None:
-                watch(counted(cycle), start)
-
-        descent = least_squares(
-            lifted.state, x, lower=lower, upper=upper, typical=lifted.typical, options=OPTIONS,
-            cycles=cycles - len(history), until=until, watch=each,
-        )  # fmt: skip
-        history, evaluations = (*history, *map(counted, descent.cycles)), evaluations + descent.evaluations
-        x, end = descent.state.x, descent.state.cost
-        ended = descent.stopped in ("gradient", "cycles", "seconds", "interrupted")
-        if ended or before - end <= _AGAIN * abs(end):
-            return dataclasses.replace(descent, cycles=history, evaluations=evaluations)
-        before = end

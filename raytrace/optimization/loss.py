@@ -3,17 +3,18 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import value
-from raytrace.optimization.least_squares import Cycle, CycleStart, Descent, least_squares
-from raytrace.optimization.lifted import Lifted, descend
+from raytrace.maths.result import plain
+from raytrace.optimization.least_squares import Cycle, CycleStart, Descent
+from raytrace.optimization.lifted import Lifted
 from raytrace.optimization.opening import opened
-from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem
+from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem, typical_of
 from raytrace.optimization.quantities import Quantity, of_configurations
 from raytrace.system.lens import Lens
 from raytrace.words import option
@@ -21,7 +22,6 @@ from raytrace.words import option
 _DENSER_CHANGE = 0.02  # relative change of a loss by denser rays, above which the descent continues
 _ROUNDS = 3  # of denser rays
 _UNLIMITED = 300  # cycles of a descent without other limits
-_FIRST = 100  # cycles of the rows that are minimised first
 
 #: Invoked after each cycle with its report and the variables (n,).
 Watch: TypeAlias = Callable[[Cycle, np.ndarray], object]
@@ -59,6 +59,12 @@ class Loss:
             )
         distances = torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1)
         return cls(function, quantity, distances, check_rings)
+
+    @property
+    def words(self) -> str:
+        """The name of the function, the quantity and the object distances."""
+        name = getattr(self.function, "__qualname__", type(self.function).__name__)
+        return f"{name} of {self.quantity} at {plain(self.object_distances)}"
 
     def __call__(self, lens: Lens) -> Tensor:
         if self.quantity is None:
@@ -127,32 +133,33 @@ class LossDescent:
 class LossDescents:
     """Descents of a loss under the conditions of a problem, whose rows of rays define the metric of the steps.
 
-    evaluated: earlier evaluations, as of `FunctionMerit`; those by denser rays are not repeated.
+    ends: lower and upper bounds (n,); evaluated: earlier evaluations, as of `FunctionMerit`; those by denser rays are
+    not repeated. stopped: "seconds" or "interrupted" where no further descent follows.
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        loss: Loss,
-        *,
-        lower: np.ndarray,
-        upper: np.ndarray,
-        typical: np.ndarray,
-        evaluated: Iterable[np.ndarray] = (),
+        self, problem: Problem, loss: Loss, ends: tuple[np.ndarray, np.ndarray], evaluated: Iterable[np.ndarray] = ()
     ):
         self.problem, self.loss = problem, loss
-        self.lower, self.upper, self.typical = lower, upper, typical
         self.function = FunctionMerit(problem.model, loss, evaluated)
+        self.settings: dict[str, Any] = {"lower": ends[0], "upper": ends[1], "typical": typical_of(problem.model)}
         self.history: list[Cycle] = []
-        self.cycle_limit, self.deadline = 0, np.inf
+        self.cycle_limit, self.deadline, self.stopped = 0, np.inf, ""
 
     def run(
-        self, start: np.ndarray, *, first: bool, restarts: int, cycles: int | None, until: float, watch: Watch
+        self,
+        start: np.ndarray,
+        *,
+        first: bool,
+        restarts: int,
+        cycles: int | None,
+        until: float,
+        watch: Watch | None = None,
     ) -> LossDescent:
         """The descents of a run.
 
         first: whether the rows are minimised first; restarts: descents from displaced lenses; cycles: of the descents
-        of the loss together, by default 300 each. Raises NoProblem.
+        of the loss together, by default 300 each. A KeyboardInterrupt ends with the best lens. Raises NoProblem.
         """
         self.cycle_limit, self.deadline = _UNLIMITED * (1 + restarts) if cycles is None else cycles, until
         initial_loss, x, pre_optimised_loss, cycles_used = self.function(start)[0], start, np.nan, 0
@@ -167,64 +174,60 @@ class LossDescents:
                 "reduce the fields or the aperture, or start from another lens"
             )
         best = self._descend(self.function, x, watch)
-        random, ends = np.random.default_rng(0), [_loss(best)]
-        for _ in range(restarts):
-            if self._is_over(best):
-                break
-            near = self._lifted(self.function).displaced(best.state.x, random)
-            near = np.clip(near, self.lower, self.upper)
-            if np.isfinite(self.function(near)[0]):
-                descent = self._descend(self.function, near, watch)
-                ends.append(_loss(descent))
-                best = descent if descent.state.is_better(best.state) else best
-        best, checked, refined, evaluations = self._checked(best, watch)
-        report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), _loss(best), checked, refined, first)
-        cycles, evaluations = cycles_used + len(self.history), evaluations + self.function.evaluations
-        return LossDescent(best.state.x, tuple(self.history), best.stopped, cycles, evaluations, report)
+        ends, checked, refined, evaluations = [best.state.cost], np.nan, 0, 0
+        random, loss = np.random.default_rng(0), self.loss
+        try:
+            for _ in range(restarts):
+                if self._is_over():
+                    break
+                near = self._lifted(self.function).displaced(best.state.x, random)
+                if np.isfinite(self.function(near)[0]):
+                    descent = self._descend(self.function, near, watch)
+                    ends.append(descent.state.cost)
+                    best = descent if descent.state.is_better(best.state) else best
+            while (denser := loss.denser()) is not None:
+                function, loss = FunctionMerit(self.problem.model, denser), denser
+                checked = function(best.state.x)[0]
+                is_same = abs(checked - best.state.cost) <= _DENSER_CHANGE * abs(checked)
+                if is_same or self._is_over() or refined == _ROUNDS:
+                    break
+                best, refined = self._descend(function, best.state.x, watch), refined + 1
+                evaluations += function.evaluations
+        except KeyboardInterrupt:  # outside the cycles of a descent
+            self.stopped = "interrupted"
+        report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), best.state.cost, checked, refined, first)
+        return LossDescent(
+            best.state.x, tuple(self.history), self.stopped or best.stopped, cycles_used + len(self.history),
+            evaluations + self.function.evaluations, report,
+        )  # fmt: skip
 
-    def _checked(self, best: Descent, watch: Watch) -> tuple[Descent, float, int, int]:
-        """A descent that continues with denser rays as long as these move the loss; the loss by still denser ones, the
-        number of descents with denser rays, and evaluations by these."""
-        loss, checked, refined, evaluations = self.loss, np.nan, 0, 0
-        while (denser := loss.denser()) is not None:
-            function, loss = FunctionMerit(self.problem.model, denser), denser
-            checked = function(best.state.x)[0]
-            is_same = abs(checked - _loss(best)) <= _DENSER_CHANGE * abs(checked)
-            if is_same or self._is_over(best) or refined == _ROUNDS:
-                break
-            best, refined = self._descend(function, best.state.x, watch), refined + 1
-            evaluations += function.evaluations
-        return best, checked, refined, evaluations
-
-    def _is_over(self, descent: Descent) -> bool:
-        is_stopped = descent.stopped in ("seconds", "interrupted")
-        return is_stopped or len(self.history) >= self.cycle_limit or time.monotonic() > self.deadline
+    def _is_over(self) -> bool:
+        return bool(self.stopped) or len(self.history) >= self.cycle_limit or time.monotonic() > self.deadline
 
     def _pre_optimised(self, start: np.ndarray) -> tuple[np.ndarray, int]:
         """Variables at the minimum of the rows, and cycles."""
-        lower, upper, typical, until = self.lower, self.upper, self.typical, self.deadline
-        opening = opened(self.problem, start, lower=lower, upper=upper, typical=typical, until=until)
-        descent = least_squares(
-            self.problem.state, opening.x, lower=lower, upper=upper, typical=typical, cycles=_FIRST, until=until
-        )
+        opening = opened(self.problem, start, until=self.deadline, **self.settings)
+        if opening.interrupted:
+            self.stopped = "interrupted"
+            return opening.x, opening.cycles
+        descent = self._lifted(self.function).minimise_rows(opening.x, until=self.deadline)
+        self.stopped = "interrupted" if descent.stopped == "interrupted" else ""
         return descent.state.x, opening.cycles + len(descent.cycles)
 
     def _lifted(self, function: FunctionMerit) -> Lifted:
-        return Lifted(function, self.problem.state, self.typical)
+        return Lifted(function, self.problem.state, **self.settings)
 
-    def _descend(self, function: FunctionMerit, x: np.ndarray, watch: Watch) -> Descent:
-        offset = len(self.history)
+    def _descend(self, function: FunctionMerit, x: np.ndarray, watch: Watch | None) -> Descent:
+        offset, lifted = len(self.history), self._lifted(function)
 
         def record_cycle(cycle: Cycle, start: CycleStart) -> None:
-            cycle = dataclasses.replace(cycle, number=cycle.number + offset, evaluations=function.evaluations)
-            self.history.append(cycle)
-            watch(cycle, start.x)
+            evaluations = function.evaluations
+            self.history.append(dataclasses.replace(cycle, number=cycle.number + offset, evaluations=evaluations))
+            if watch is not None:
+                watch(self.history[-1], start.x)
 
-        return descend(
-            self._lifted(function), x, lower=self.lower, upper=self.upper, cycles=self.cycle_limit - offset,
-            until=self.deadline, watch=record_cycle,
-        )  # fmt: skip
-
-
-def _loss(descent: Descent) -> float:
-    return descent.state.cost
+        cycles = 0 if self.stopped else self.cycle_limit - offset
+        descent = lifted.descend(x, cycles=cycles, until=self.deadline, watch=record_cycle)
+        if descent.stopped in ("seconds", "interrupted"):
+            self.stopped = descent.stopped
+        return descent

@@ -110,8 +110,8 @@ def optimize(
     each; test_plates: a list (.csv, `stock.plates.read_plates`), from which each variable radius takes a value likewise
     (`optimization.fitting`); `Optimized.fitted` reports both.
     log: a file with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file
-    of the same lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming, whose
-    rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
+    of the same lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming,
+    whose rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
     after each cycle, except those of the choice of glasses, with its report and lens, while the system is opened the
     best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
@@ -216,13 +216,18 @@ def optimize(
     def lens_at(x: np.ndarray) -> Lens:
         return _lens_at(problem.model, x, data, bounded)
 
+    def ended(x: np.ndarray, history: Sequence[Cycle], after: Evaluated, **more: Any) -> Optimized:
+        """The result at variables x (n,), with its warnings; more: further fields."""
+        results = _attained(problem, after, x, lower=lower, upper=upper)
+        seconds = time.monotonic() - started
+        end, model = lens_at(x), problem.model
+        return _warned(_optimized(lens, end, model, x, history, conditions=results, seconds=seconds, **more))
+
     if conditions:
         refuse_contradictions(problem, start, lower=lower, upper=upper)
     if loss is not None:
         measured = Loss.of(loss, quantity, object_distances, check_rings)
-        descents = LossDescents(
-            problem, measured, lower=lower, upper=upper, typical=typical, evaluated=resumed.evaluated
-        )  # fmt: skip
+        descents = LossDescents(problem, measured, (lower, upper), resumed.evaluated)
         with observer(dependencies, lens_at) as seen:
 
             def each(cycle: Cycle, x: np.ndarray) -> None:
@@ -235,14 +240,10 @@ def optimize(
             seen.write(
                 reached.x, reached.report.end, len(reached.history), evaluated=descents.function.evaluated, now=True
             )  # fmt: skip
-        end = lens_at(reached.x)
-        result = _optimized(
-            lens, end, model, reached.x, reached.history, merits=(reached.report.start, reached.report.end),
-            cycles=reached.cycles, evaluations=reached.evaluations, stopped=reached.stopped,
-            seconds=time.monotonic() - started, loss=reached.report,
-            conditions=_attained(problem, problem.evaluated(reached.x), reached.x, lower=lower, upper=upper),
+        return ended(
+            reached.x, reached.history, problem.evaluated(reached.x), cycles=reached.cycles, stopped=reached.stopped,
+            merits=(reached.report.start, reached.report.end), evaluations=reached.evaluations, loss=reached.report,
         )  # fmt: skip
-        return _warned(result)
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
     seconds_of_end = time.monotonic() - evaluating
@@ -289,20 +290,17 @@ def optimize(
         descent = dataclasses.replace(descent, state=design.state, stopped=stopped)
     x, count = descent.state.x, len(problem.rows)
     after = problem.evaluated(x)
-    results = _attained(problem, after, x, lower=lower, upper=upper)
-    end = lens_at(x)
-    result = _optimized(
-        lens, end, problem.model, x, descent.history, rows=problem.rows, start=start,
+    return ended(
+        x, descent.history, after, rows=problem.rows, start=start,
         merits=(problem.merit(before, model.start), problem.merit(after, x)),
         values=(before.values[:count], after.values[:count]),
         contributions=(before.contributions(np.arange(count)), after.contributions(np.arange(count))),
         cycles=descent.cycles + opening.cycles + (choice.descended if choice else 0) + descended,
         evaluations=descent.evaluations + (choice.evaluations if choice else 0) + evaluations,
-        stopped="interrupted" if opening.interrupted else descent.stopped, seconds=time.monotonic() - started,
-        glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing, conditions=results,
-        as_built=None if term is None else AsBuiltChange.of(term, lens, end), fitted=fitted,
+        stopped="interrupted" if opening.interrupted else descent.stopped,
+        glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing,
+        as_built=None if term is None else AsBuiltChange.of(term, lens, lens_at(x)), fitted=fitted,
     )  # fmt: skip
-    return _warned(result)
 
 
 def _refuse_beside_fit(fit: str, **given: bool) -> None:

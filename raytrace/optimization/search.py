@@ -25,9 +25,9 @@ from raytrace.analysis.spot_diagram import spot
 from raytrace.files import NotWritten, check_output_folder, write_table
 from raytrace.io import LensFileError, LensFileWarning, write_lens
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Column, Result, Table, plain
+from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.attained import conditions_attained
-from raytrace.optimization.between import between, warn_of_worse, worse_between
+from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.curriculum import Growth, Plan
@@ -43,7 +43,6 @@ from raytrace.optimization.problem import (
     NoProblem,
     Problem,
     optimization_data_of,
-    typical_of,
 )
 from raytrace.optimization.quantities import Quantity, quantity_of
 from raytrace.optimization.removal import elements_of, removals
@@ -63,6 +62,7 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import bounds_of, design_variables
 from raytrace.plotting import style
+from raytrace.psf_models import EmptyPsf
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
@@ -225,7 +225,7 @@ def searched(
     seconds: float,
     as_built: ExpectationSettings | None = None,
 ) -> Searched:
-    """The result: minima, the best first, each with its problem, and their losses."""
+    """The result: minima, the best first, each with its problem, and their losses. Warns WorseBetween of the best."""
     terms: list[tuple[float, float, float]] = []
     if as_built is not None:
         terms = [_as_built(task.whole, minimum, as_built) for task, minimum in each[:MOST]]
@@ -238,6 +238,8 @@ def searched(
         lenses.append(_design(problem, minimum.result.x, f"{lens.name}, minimum {k}".removeprefix(", ")))
         tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
     names = tuple(dict.fromkeys(name for table in tables for name in table))
+    gaps = [between(of_minimum) for of_minimum in lenses]
+    warn_of_worse([gap for gap in gaps[0] if gap.is_worse])
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
     return Searched(
         before=lens,
@@ -251,7 +253,7 @@ def searched(
             [first_order(lens_of_minimum).effective_focal_length.reshape(()) for lens_of_minimum in lenses]
         ),
         spots=_spots(lens, lenses),
-        between=tensor([max((gap.ratio for gap in between(each)), default=np.nan) for each in lenses]),
+        between=tensor([max((gap.ratio for gap in of_lens), default=np.nan) for of_lens in gaps]),
         times_reached=torch.tensor([minimum.descents for _, minimum in minima]),
         after=tensor([minimum.seconds for _, minimum in minima]),
         starts=starts,
@@ -352,7 +354,8 @@ _SHORT = 10, 12  # cycles on the narrow and on the whole beam
 _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
-_BY_LOSS = 8  # minima that are followed to minima of a loss
+_BY_LOSS = 8  # minima that are followed to minima of a loss, if it is at most so many times that of the best one there:
+_PROMISING = 2.0
 _REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
 _DAMPED = SolverOptions(damping=0.1, bends=False)
 
@@ -392,8 +395,9 @@ def search(
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of
     the merit function alone, in the order of the merit with this term; of each lens with the tolerances of its own
     surfaces.
-    loss, of, object_distances: as for `optimize`; the eight best minima are followed to minima of the loss, between the
-    same bounds and under the same conditions, and these are the result, in its order; merit and spots are those there.
+    loss, of, object_distances: as for `optimize`; of the eight best minima of the merit function those are followed to
+    minima of the loss, in at most 120 cycles, whose loss is at most twice the least, between the same bounds and under
+    the same conditions; these are the result, in the order of the loss; merit and spots are those there.
     folder: keeps the minima as lens files, a table and figures, and the journal: called again the search resumes, with
     the same result as without the interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all
     descents is written there.
@@ -471,7 +475,6 @@ def search(
         lens, each, losses=losses, starts=run.started, descents=run.followed, stopped=stopped,
         seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
-    warn_of_worse(worse_between(result.lens))
     warn_of_defects(result.lens)
     if folder is not None and not (share and share.rank):
         try:
@@ -484,20 +487,16 @@ def search(
 def _followed_by_loss(
     each: Sequence[tuple[SearchProblem, Minimum]], loss: Loss, journal: Journal, progress: Callable | None
 ) -> tuple[list[tuple[SearchProblem, Minimum]], list[float]]:
-    """The best minima at the minima of a loss that lie below them, and their losses, in its order; then the others."""
-    name = getattr(loss.function, "__qualname__", type(loss.function).__name__)
-    key = f"loss {name} of {loss.quantity} at {plain(loss.object_distances)}"
+    """The best minima at the minima of a loss that lie below them, and their losses, in its order; after an interrupt
+    the others behind them."""
+    key = f"loss {loss.words}"
 
     def minimised(task: SearchProblem, x: np.ndarray) -> TaskResult:
-        begun, space = time.process_time(), task.space
-        descents = LossDescents(
-            task.whole, loss, lower=space.lower, upper=space.upper, typical=typical_of(task.model)
-        )  # fmt: skip
+        begun = time.process_time()
+        descents = LossDescents(task.whole, loss, (task.space.lower, task.space.upper))
         try:
-            end = descents.run(
-                x, first=False, restarts=0, cycles=None, until=journal.until, watch=lambda cycle, x: None
-            )  # fmt: skip
-        except NoProblem:  # rays of the loss fail
+            end = descents.run(x, first=False, restarts=0, cycles=LONG, until=journal.until)
+        except (NoProblem, EmptyPsf):  # rays of the loss fail
             return TaskResult(np.inf, np.inf, np.inf, time.process_time() - begun, x)
         if end.stopped in ("interrupted", "seconds"):
             raise SearchStopped
@@ -505,10 +504,22 @@ def _followed_by_loss(
         value = end.report.checked if np.isfinite(end.report.checked) else end.report.end
         return TaskResult(0.0, missed, value, time.process_time() - begun, end.x)
 
+    @torch.no_grad()
+    def before(task: SearchProblem, minimum: Minimum) -> float:
+        try:
+            value = float(loss(task.model.lens_at(torch.tensor(minimum.result.x))))
+        except EmptyPsf:
+            value = np.nan
+        return value if np.isfinite(value) else np.inf
+
+    values = [before(*pair) for pair in each[:_BY_LOSS]]
+    most = min(values) + (_PROMISING - 1) * abs(min(values))
+    promising = [each[k] for k, value in enumerate(values) if value <= most]
+    others = [each[k] for k in range(len(each)) if k >= len(values) or values[k] > most]
     ends: list[tuple[float, SearchProblem, Minimum]] = []
-    bar = None if progress is None else progress(min(len(each), _BY_LOSS), "descent")
+    bar = None if progress is None else progress(len(promising), "descent")
     try:
-        for task, minimum in each[:_BY_LOSS]:
+        for task, minimum in promising:
             x = minimum.result.x
             (end,) = journal.each([(f"{minimum.task}, {key}", partial(minimised, task, x))], len(x))
             merit = task.whole.merit(task.whole.evaluated(end.x), end.x)
@@ -521,9 +532,9 @@ def _followed_by_loss(
         if bar is not None:
             bar.close()
     ends.sort(key=lambda end: end[0])
-    rest = list(each[len(ends) :]) if len(ends) < min(len(each), _BY_LOSS) else []
-    losses = [loss for loss, _, _ in ends] + [np.nan] * len(rest)
-    return [(task, minimum) for _, task, minimum in ends] + rest, losses
+    followed = [(task, minimum) for _, task, minimum in ends]
+    rest = [] if len(ends) == len(promising) else [*promising[len(ends) :], *others]
+    return [*followed, *rest], [value for value, _, _ in ends] + [np.nan] * len(rest)
 
 
 @dataclass
