@@ -14,6 +14,7 @@ import torch
 from problems import number
 
 from raytrace.files import shipped
+from raytrace.imaging import field_kernels
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import (
     camera_error,
@@ -572,6 +573,44 @@ def test_a_kernel_does_not_depend_on_its_batch(model):
     torch.testing.assert_close(other[1], kernels[1], rtol=0, atol=1e-11)
     torch.testing.assert_close(alone[0], kernels[1], rtol=0, atol=1e-11)
     torch.testing.assert_close(own.kernels(distances, 1).detach(), kernels, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("model", "normalise"), [("gaussian", "window"), ("gaussian", "energy"), ("drt", "window")])
+def test_kernels_of_a_clipped_lens_are_computed_together(model, normalise, monkeypatch):
+    """At places and distances of their own, some clipped and some not: those of each pair alone, to rounding, with
+    their derivatives; one call of the Gaussian model, and one search of field points."""
+    settings = dataclasses.replace(
+        SMALL, vignetting="semi-diameters", wavelengths=(0.48, 0.6), wavelength_weights=(1, 1)
+    )
+    lens = lens_at_start(read_lens("cooke_triplet"), dataclasses.replace(settings, f_number=4.0))
+    parameters = Gaussian(order=3) if model == "gaussian" else DRT(order=0)
+    own = Camera(
+        Variables(lens, "curvature:1,4 sensor"), Same(), sensor=Sensor((28, 20), (1400, 1000)), model=parameters,
+        pixels=9, normalise=normalise,
+    )  # fmt: skip
+    points, distances = (
+        number([[0.0, 6.0, 13.0, 0.0, 4.0], [0.0, 2.0, 8.0, 9.0, 2.0]]),
+        number([8e3, 2e4, 1e4, 2e4, 2e4]),
+    )
+    calls, aimed, fields_of = [], [], Sensor.fields
+    monkeypatch.setattr(field_kernels, "psf", lambda *a, **o: (calls.append(a), psf(*a, **o))[1])
+    monkeypatch.setattr(Sensor, "fields", lambda *a: (aimed.append(a), fields_of(*a))[1])
+
+    def slopes(kernels):
+        each = torch.autograd.grad(kernels.square().sum(), [*own.variables.parameters()], retain_graph=True)
+        return torch.stack(each)
+
+    together = own.kernels(distances, points=points)
+    assert len(aimed) == 1
+    assert len(calls) == (1 if model == "gaussian" else 5)
+    for k in range(5):
+        alone = own.kernels(distances[[k]], points=points[:, [k]])
+        torch.testing.assert_close(together[k], alone[0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(slopes(together[k]), slopes(alone), rtol=1e-8, atol=1e-11)
+    with torch.no_grad():
+        together = own.kernels(distances, points=points)
+        alone = torch.cat([own.kernels(distances[[k]], points=points[:, [k]]) for k in range(5)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-12)
 
 
 def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():

@@ -12,6 +12,7 @@ from raytrace.maths.sampling import Grid, grid
 from raytrace.psf_models import drt
 from raytrace.psf_models.drt import fit, kernels, reference
 from raytrace.system.lens import Lens
+from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -144,3 +145,36 @@ def test_half_of_a_symmetric_fan_represents_all_of_it(monkeypatch):
     assert not torch.equal(half[0], whole[0])
     for one, all_of_it in zip(half, whole, strict=True):
         torch.testing.assert_close(one, all_of_it, rtol=1e-8, atol=1e-9)
+
+
+def test_apertures_beyond_the_beam_are_left_out_of_the_cells(monkeypatch):
+    """A rim of which the beam stays clear costs no shares of cells; one that clips it is counted."""
+    where, seen = window(scene_of(sharp_double_gauss(), 11.0)), []
+    clear_share = drt.clear_share
+    monkeypatch.setattr(
+        drt, "clear_share", lambda clear, *a, **o: (seen.append(len(clear)), clear_share(clear, *a, **o))[1]
+    )
+
+    def kernel(**rims: float) -> tuple[torch.Tensor, torch.Tensor, set[int]]:
+        lens, curvature = sharp_double_gauss(), number(0.0).requires_grad_()
+        lens = lens.replace(3, curvature=lens.surfaces[3].curvature + curvature)
+        for name, radius in rims.items():
+            lens = lens.replace(int(name[1:]), apertures=(Aperture("circular", (0.0, radius)),))
+        seen.clear()
+        energy = kernels(scene_of(lens, 11.0), where, order=0).kernel
+        (slope,) = torch.autograd.grad(energy.square().sum(), curvature)
+        return energy.detach(), slope, set(seen)
+
+    (bare, _, none), (wide, _, left) = kernel(), kernel(s1=40.0, s10=60.0)
+    assert none == left == {0}
+    assert torch.equal(bare, wide)
+    (clips, slope, one), (both, by_both, still) = kernel(s1=18.0), kernel(s1=18.0, s10=60.0)
+    assert one == still == {1}
+    assert torch.equal(clips, both)
+    assert torch.equal(slope, by_both)
+    assert float(clips.sum()) < 0.98 * float(bare.sum())
+    monkeypatch.setattr(drt, "_bounded", lambda ray_map, *rest: ray_map)
+    every, by_every, all_of_them = kernel(s1=18.0, s10=60.0)
+    assert all_of_them == {2}
+    torch.testing.assert_close(both, every, rtol=0, atol=1e-15)
+    torch.testing.assert_close(by_both, by_every, rtol=1e-12, atol=0)

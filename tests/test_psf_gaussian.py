@@ -331,6 +331,45 @@ def test_a_batch_is_its_single_kernels_at_every_order(lens):
         torch.testing.assert_close(whole.covariance[:, d, f], one.covariance[:, 0, 0], rtol=1e-10, atol=1e-14)
 
 
+@pytest.mark.parametrize("kind", ["rims", "obscuration"])
+def test_clipped_beams_of_a_batch_are_searched_at_once_and_leave_the_others(kind, monkeypatch):
+    """Two rims whose images cross in the pupil, or a stop in part of the beam: values and derivatives of each kernel
+    are those of a call for it alone, whose rays are as many."""
+    lens, searched = clipped(clipped(lens_at(), 1, 19.0), 10, 13.0), []
+    if kind == "obscuration":
+        lens = obscured(lens_at(), 1, 4.0, (0.0, -12.0))
+    curvature, radius = lens.surfaces[3].curvature.clone().requires_grad_(), scalar(19.0).requires_grad_()
+    lens = lens.replace(3, curvature=curvature)
+    if kind == "rims":
+        lens = lens.replace(1, apertures=(Aperture("circular", (0.0, radius)),))
+    arms_of = gaussian.arms_of
+    monkeypatch.setattr(
+        gaussian, "arms_of", lambda scene, *rest: (searched.append(scene.shape), arms_of(scene, *rest))[1]
+    )
+    fields, distances, colours = (
+        vector(0.0, 1.0, 0.5, 1.0, 6.0, 14.0).reshape(2, 3),
+        vector(5e3, 25e3),
+        vector(0.48, 0.6),
+    )
+    where = Grid(scalar(0.05), 3, 3, vector(0.0, 8.0))
+    whole = gaussian.kernels(scene(lens, fields, distances, colours), where, order=4)
+    assert len(searched) == 1
+    if kind == "rims":
+        assert searched[0] == (4, 1, 2)  # the beam of the axis is not clipped
+    by = [curvature, *([radius] if kind == "rims" else [])]
+    for d in range(2):
+        for f in range(3):
+            one = gaussian.kernels(scene(lens, fields[:, f : f + 1], distances[d : d + 1], colours), where, order=4)
+            torch.testing.assert_close(whole.kernel[d, f], one.kernel[0, 0], rtol=0, atol=1e-13)
+            torch.testing.assert_close(whole.residual[d, f], one.residual[0, 0], rtol=1e-9, atol=1e-12)
+            found, wanted = (
+                torch.autograd.grad(k.square().sum(), by, retain_graph=True, materialize_grads=True)
+                for k in (whole.kernel[d, f], one.kernel[0, 0])
+            )
+            for slope, alone in zip(found, wanted, strict=True):
+                torch.testing.assert_close(slope, alone, rtol=1e-10, atol=1e-14)
+
+
 def test_a_dark_kernel_of_a_batch_is_zero_and_leaves_the_others():
     lens = clipped(lens_at(), 6, 7.0)
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()

@@ -16,7 +16,7 @@ without a lens, every place has the kernel of the axis: a paraxial camera.
 import dataclasses
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, TypeAlias
 
 import torch
@@ -131,9 +131,9 @@ class FieldKernels:
             order.append(group)
         return torch.cat(parts)[torch.cat(order).argsort()]
 
-    def of_pairs(self, fields: Tensor) -> Tensor:
+    def of_pairs(self, fields: Tensor, *, of_points: bool = False) -> Tensor:
         """Kernels (N, C, size, size) of field points (2, N), each with its object distance of (N,), and of a batch of N
-        lenses each with its lens."""
+        lenses each with its lens. of_points: as for `of_fields`."""
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             fields = torch.zeros_like(fields)
         keys = [self.object_distances.detach().isfinite()]
@@ -148,11 +148,28 @@ class FieldKernels:
             group = torch.nonzero(which == number)[:, 0]
             kernels, places = self._of(group), fields[:, group[:1]] if is_by_field else fields[:, group, None]
             origin = kernels.origin(places)  # the chief rays of all lenses are aimed and traced at once
-            for some in torch.arange(len(group), device=group.device).split(count):
-                part = places if is_by_field else places[:, some]
-                parts.append(kernels._of(some)._about(part, origin[:, some])[0])
-            order.append(group)
+            for alike in self._alike(fields[:, group]):
+                for some in alike.split(count):
+                    part = places if is_by_field else places[:, some]
+                    parts.append(kernels._of(some)._about(self._sampled(part, of_points), origin[:, some])[0])
+                    order.append(group[some])
         return torch.cat(parts)[torch.cat(order).argsort()]
+
+    def _alike(self, fields: Tensor) -> list[Tensor]:
+        """Numbers of fields (2, N) of each symmetry, on the axis, in the y-z plane and others, if apertures may clip.
+
+        The arms of a clipped beam fill the part of the pupil that symmetry needs: that of other fields would change it.
+        """
+        if varies(fields) or not any(surface.apertures for surface in self.lens.surfaces):
+            return [torch.arange(fields.shape[1], device=fields.device)]
+        rank = (fields[0] == 0).long() + (fields == 0).all(0)
+        return [torch.nonzero(rank == number)[:, 0] for number in rank.unique()]
+
+    def _sampled(self, fields: Tensor, of_points: bool) -> Tensor:
+        """Fields of a call; field points that vary break symmetry: one sampling, with derivatives or not."""
+        if of_points and MODELS[self.model].in_common and not varies(fields):
+            return fields.detach().requires_grad_()
+        return fields
 
     def _of(self, numbers: Tensor) -> "FieldKernels":
         """Of some of the object distances, and of a batch of lenses some of them."""
@@ -160,28 +177,36 @@ class FieldKernels:
         return dataclasses.replace(self, lens=lens, object_distances=self.object_distances[numbers])
 
     def _groups(self) -> list[Tensor]:
-        """Numbers of the places whose kernels one call computes: their distances are all finite or all infinite."""
+        """Numbers of the pairs that `_paired` takes at once: their distances are all finite or all infinite."""
         distances = self.object_distances.detach()
-        if MODELS[self.model].traces and not self._has_radii:
+        if self._is_of_waves:
             return [torch.nonzero(distances == distance)[:, 0] for distance in distances.unique()]
         sides = [torch.nonzero(side)[:, 0] for side in (distances.isfinite(), distances.isinf())]
         near_first = (side[distances[side].argsort()] for side in sides if len(side))
-        count = 1 if is_sampled_in_common(self.lens, self.model) else _DISTANCES
+        count = _TOGETHER if MODELS[self.model].traces else _DISTANCES
         return [some for side in near_first for some in side.split(count)]
 
+    @property
+    def _is_of_waves(self) -> bool:
+        """Whether the distances of a call share the sampling of traced waves."""
+        return MODELS[self.model].by_field or bool(self.elements)
+
     def _paired(self, points: Tensor) -> Tensor:
-        """`paired` of a group that one call computes."""
+        """`paired` of a group of pairs."""
         distances, which = _distinct(self.object_distances)
-        kernels = dataclasses.replace(self, object_distances=distances)
         if not MODELS[self.model].traces:
+            kernels = dataclasses.replace(self, object_distances=distances)
             return kernels._in_parts(torch.zeros_like(points[:, :1]))[0, which]
         if self._has_radii:
-            # Moments of all radii and distances, pixels of the pairs: these cost more.
             radii, places = self._distinct_radii(points)
-            moments = [moment[which, places][None] for moment in kernels._moments(radii)]
-            return self._gaussians(points, moments)[:, 0]
+            pairs, number = torch.unique(places * len(distances) + which, return_inverse=True)
+            fields = self._of_radii(radii)[:, pairs // len(distances), None]
+            kernels = dataclasses.replace(self, object_distances=distances[pairs % len(distances)])
+            return self._gaussians(points, [moment[:, 0][None, number] for moment in kernels._moments(fields)])[:, 0]
+        if not self._is_of_waves:
+            return self._mirrored(points, lambda places, some: self._of(some)._of_places(places)[:, None], which)[:, 0]
         if len(distances) == 1:
-            return kernels._of_one_distance(points)[:, 0]
+            return dataclasses.replace(self, object_distances=distances)._of_one_distance(points)[:, 0]
         pairs = zip(distances.split(1), points.split(1, 1), strict=True)  # each with its own derivative by the distance
         return torch.cat([dataclasses.replace(self, object_distances=z)._of_one_distance(p)[:, 0] for z, p in pairs])
 
@@ -200,16 +225,28 @@ class FieldKernels:
     def _of_one_distance(self, points: Tensor) -> Tensor:
         if not MODELS[self.model].traces:  # first-order models image all fields alike
             return self._in_parts(torch.zeros_like(points[:, :1])).expand(points.shape[1], *(-1,) * 4)
-        if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
-            return self._in_parts(points)
         compute = self._turned if self._has_radii else self._in_parts
+        return self._mirrored(
+            points, lambda places, some: compute(places), torch.zeros_like(points[0], dtype=torch.long)
+        )
+
+    def _mirrored(self, points: Tensor, compute: Callable[[Tensor, Tensor], Tensor], distance: Tensor) -> Tensor:
+        """Kernels (N, D, C, size, size) of points (2, N) mm, of a round lens computed in one octant and mirrored.
+
+        compute: points (2, n), and their numbers among the N -> kernels (n, D, C, size, size); distance: (N,) number of
+        the object distance of each.
+        """
+        if not is_round_about_axis(self.lens) or not all(map(is_radial, self.elements)):
+            return compute(points, torch.arange(points.shape[1], device=points.device))
         octant = torch.stack([points.abs().amin(0), points.abs().amax(0)])
-        places, which = torch.unique((octant / self.sensor.pitch * 1e6).round(), dim=1, return_inverse=True)
+        keys = torch.cat([(octant / self.sensor.pitch * 1e6).round(), distance[None].to(octant)])
+        places, which = torch.unique(keys, dim=1, return_inverse=True)
+        numbers = torch.arange(points.shape[1], device=which.device)
         if self.model == "gaussian" and places.shape[1] == points.shape[1]:  # no place is the image of another
-            return compute(points)
+            return compute(points, numbers)
         first = torch.full_like(places[0], points.shape[1], dtype=torch.int64)
-        first = first.scatter_reduce(0, which, torch.arange(points.shape[1], device=which.device), "amin")
-        kernels = compute(octant[:, first])[which].flip(-1)  # columns towards +x
+        first = first.scatter_reduce(0, which, numbers, "amin")
+        kernels = compute(octant[:, first], first)[which].flip(-1)  # columns towards +x
         for mask, move in (
             (points[0].abs() > points[1].abs(), lambda kernel: kernel.transpose(-1, -2)),
             (points[0] < 0, lambda kernel: kernel.flip(-1)),
@@ -217,6 +254,13 @@ class FieldKernels:
         ):
             kernels = torch.where(mask[:, None, None, None, None], move(kernels), kernels)
         return kernels.flip(-1)
+
+    def _of_places(self, points: Tensor) -> Tensor:
+        """Kernels (N, C, size, size) of points (2, N) mm, each with its object distance, by the PSF model."""
+        fields = self.sensor.fields(self.lens, points)
+        arrives = ~fields.isnan().any(0)
+        kernels = self.of_pairs(fields.nan_to_num(0.0), of_points=True)
+        return torch.where(arrives[:, None, None, None], kernels, 0.0)
 
     def _in_parts(self, points: Tensor) -> Tensor:
         """By the PSF model, field by field; the chief rays of all places are aimed and traced at once."""
@@ -232,13 +276,12 @@ class FieldKernels:
         field points belong to points of the sensor, and vary with the lens.
         """
         count = 1 if is_sampled_in_common(self.lens, self.model) else _TOGETHER
-        kernels = []
-        for part, origin in zip(fields.split(count, 1), self.origin(fields).split(count, 2), strict=True):
-            if of_points and MODELS[self.model].in_common and not varies(part):
-                # Field points that vary break symmetry: one sampling, with derivatives or not.
-                part = part.detach().requires_grad_()
-            kernels.append(self._about(part, origin))
-        return torch.cat(kernels)
+        kernels, order, origin = [], [], self.origin(fields)
+        for alike in self._alike(fields):
+            for some in alike.split(count):
+                kernels.append(self._about(self._sampled(fields[:, some], of_points), origin[:, :, some]))
+                order.append(some)
+        return torch.cat(kernels)[torch.cat(order).argsort()]
 
     def _about(self, fields: Tensor, origin: Tensor) -> Tensor:
         """Kernels (F, D, C, size, size) of fields (2, F), (2, D, F) about their origins, of one call of the model."""
@@ -285,10 +328,11 @@ class FieldKernels:
         """Gaussians of the moments along a radius, turned to the azimuth of every place."""
         distinct, which = self._distinct_radii(points)
         if len(distinct) <= self.nodes:
-            moments = [moment[:, which] for moment in self._moments(distinct)]
+            moments = [moment[:, which] for moment in self._moments(self._of_radii(distinct))]
         else:  # linear between radii: vignetting factors are, too, with a kink on the axis
             nodes = radii(points, self.nodes)
-            moments = [along(nodes, moment.movedim(1, 0), points).movedim(0, 1) for moment in self._moments(nodes)]
+            each = self._moments(self._of_radii(nodes))
+            moments = [along(nodes, moment.movedim(1, 0), points).movedim(0, 1) for moment in each]
             moments[-1] = (moments[-1] > 1 - 1e-9).to(moments[-1])  # no light between a radius with and one without
         return self._gaussians(points, moments)
 
@@ -329,22 +373,33 @@ class FieldKernels:
                 order.append(some)
         return torch.cat(kernels)[torch.cat(order).argsort()]
 
-    def _moments(self, radii: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _of_radii(self, radii: Tensor) -> Tensor:
+        """Field points (2, K) of radii (K,) mm along +y; nan where no chief ray arrives."""
+        return self.sensor.fields(self.lens, torch.stack([torch.zeros_like(radii), radii]))
+
+    def _moments(self, fields: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Centroid from the origin, mm, sagittal and tangential variance, mm², and 1 where light arrives, else 0,
-        (D, K, W) at radii (K,) along +y."""
-        points = torch.stack([torch.zeros_like(radii), radii])
-        fields = self.sensor.fields(self.lens, points)
+        (D, K, W) of field points (2, K), (2, D, K) of `_of_radii`."""
         arrives, fields = ~fields.isnan().any(0), fields.nan_to_num(0.0)
-        spots = psf(
-            self.lens, self._model, fields=fields, object_distances=self.object_distances, per_wavelength=True,
-            grid=make_grid(radii.new_tensor(1.0), 1),
-        )  # fmt: skip
-        known = arrives[:, None] & ~spots.centroid[1].isnan()
-        shift, sagittal, tangential = (
-            torch.where(known, moment, 0.0)
-            for moment in (spots.centroid[1] - self.origin(fields)[1], spots.covariance[0], spots.covariance[2])
+        axis = 1 if fields.dim() == 2 else 0  # of fields, or of pairs
+        parts, order = [], []
+        for some in self._alike(fields.flatten(1)):
+            distances = self.object_distances if axis else self.object_distances[some]
+            kernels, places = dataclasses.replace(self, object_distances=distances), fields[:, some]
+            spots = psf(
+                self.lens, self._model, fields=places, object_distances=distances, per_wavelength=True,
+                grid=make_grid(fields.new_tensor(1.0), 1),
+            )  # fmt: skip
+            known = arrives[some][..., None] & ~spots.centroid[1].isnan()
+            shift = spots.centroid[1] - kernels.origin(places)[1]
+            each = (torch.where(known, moment, 0.0) for moment in (shift, spots.covariance[0], spots.covariance[2]))
+            parts.append((*each, known.to(shift)))
+            order.append(some)
+        number = torch.cat(order).argsort()
+        shift, sagittal, tangential, light = (
+            torch.cat(p, axis).index_select(axis, number) for p in zip(*parts, strict=True)
         )
-        return shift, sagittal, tangential, known.to(radii)
+        return shift, sagittal, tangential, light
 
     def origin(self, fields: Tensor) -> Tensor:
         """Points (2, D, N, 1 or W) mm where chief rays of fields (2, N), (2, D, N) meet the sensor: see `origin`."""

@@ -595,6 +595,7 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
         return _kernels_of_meridian(scene, grid, ray_map, order)
     # Cells of order 0 are one pixel wide, measured on a coarse map; each order makes them √2 narrower.
     coarse = fans_of_map(ray_map, 2 * _MAP_LINES, _MAP_LINES)
+    ray_map = _bounded(ray_map, coarse, scene.largest)
     *widths, both = cell_widths(grid, coarse.points, scene.largest)
     across, along = (
         2 * math.ceil(min(_MOST_LINES, max(least, width * 2 * least) * both * 2 ** (order / 2)) / 2)
@@ -610,6 +611,21 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     centroid, covariance, arrived = moments_of_fans(fans)
     kernels = Kernels(kernel * light[..., None, None], grid, centroid, covariance, ray_map.rays, arrived * light)
     return _with_residual(kernels, ray_map.residual)
+
+
+def _bounded(ray_map: RayMap, coarse: Fans, largest: Callable[[Tensor], Tensor]) -> RayMap:
+    """The map without the apertures that stop no light of the whole scene: no cell comes near their edges.
+
+    Between the nodes of a coarse fan a clearance falls by less than it changes from node to node, in either direction.
+    """
+    kept = []
+    for number, clear in enumerate(coarse.clearances):
+        c = clear.detach()
+        change = c.diff().abs().amax() + (torch.roll(c, -1, -2) - c).abs().amax()
+        if not float(largest(change - c.amin())) < 0:
+            kept.append(number)
+    crossings, apertures = (tuple(part[k] for k in kept) for part in (ray_map.crossings, ray_map.apertures))
+    return dataclasses.replace(ray_map, crossings=crossings, apertures=apertures)
 
 
 def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -386,7 +387,8 @@ class Light:
 
     hits: (2, D, F, W, P) mm on the sensor; valid: (D, F, W, P), those that arrive; weights: (P,) or (D, F, W, P),
     shares of the pupil, 1 in all; rays: how many were traced for each kernel. arms: those that the rays fill where the
-    beam is clipped, else None.
+    beam is clipped, else None. pairs: (K,) numbers d F + f of the pairs of a distance and a field whose light it is, in
+    place of D and F; None for all.
     """
 
     hits: Tensor
@@ -394,6 +396,7 @@ class Light:
     weights: Tensor
     rays: int
     arms: Arms | None = None
+    pairs: Tensor | None = None
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
@@ -406,8 +409,16 @@ def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     through the whole entrance pupil, of which vignetting factors leave the share (1 - VCX)(1 - VCY); 0 with gradient 0
     where no ray arrives.
     """
-    light, shape, gaussians = _kernels(scene, grid, order)
-    return dataclasses.replace(gaussians, residual=residual(light, grid, shape, order, symmetry(scene)))
+    lights, shape, gaussians = _kernels(scene, grid, order)
+    fold, residuals = symmetry(scene), []
+    for light in lights:
+        window, part = grid, shape
+        if light.pairs is not None:
+            centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1)))
+            window = dataclasses.replace(grid, centre=_of_pairs(centre.expand(2, *scene.shape), light))
+            part = _of_pairs(shape[None], light)[0]
+        residuals.append(residual(light, window, part, order, fold))
+    return dataclasses.replace(gaussians, residual=_merged(lights, residuals))
 
 
 def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
@@ -430,26 +441,45 @@ def kernels_of_points(scene: Scene, grid: Grid, points: Tensor) -> Kernels:
     return Kernels(energy[..., None, None] * pixels, grid, centroid, covariance, points.shape[1], energy)
 
 
-def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[Light, Tensor, Kernels]:
+def _kernels(scene: Scene, grid: Grid, order: int) -> tuple[list[Light], Tensor, Kernels]:
     """The light, the share of every pixel in the light that arrives, and the kernels."""
     fold = symmetry(scene)
-    light = trace_light(scene, order, fold)
-    arrives = torch.where(light.valid, light.weights, 0.0)
-    centroid, covariance = moments_of_rays(light.hits, arrives, fold)
-    energy = arrives.sum(-1) * beam_share(scene)
+    lights = trace_light(scene, order, fold)
+    arrives = [torch.where(light.valid, light.weights, 0.0) for light in lights]
+    moments = [moments_of_rays(light.hits, some, fold) for light, some in zip(lights, arrives, strict=True)]
+    centroid, covariance = (_merged(lights, parts) for parts in zip(*moments, strict=True))
+    energy = _merged(lights, [some.sum(-1) for some in arrives]) * beam_share(scene)
     shape = gaussian_pixels(grid, centroid, covariance if fold == "none" else covariance[::2])
-    return light, shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays, energy)
+    kernels = energy[..., None, None] * shape
+    return lights, shape, Kernels(kernels, grid, centroid, covariance, lights[-1].rays, energy)
 
 
-def trace_light(scene: Scene, order: int, fold: str) -> Light:
-    """The rays of an order, of the part of the pupil that symmetry needs.
+def _merged(lights: list[Light], parts: Sequence[Tensor]) -> Tensor:
+    """Numbers (..., D, F, W) of all kernels, in which those of pairs replace the ones of the first light."""
+    merged = parts[0]
+    for light, part in zip(lights[1:], parts[1:], strict=True):
+        axis = part.dim() - 3
+        each = merged.flatten(axis, axis + 1).index_copy(axis, light.pairs, part.flatten(axis, axis + 1))
+        merged = each.unflatten(axis, merged.shape[axis : axis + 2])
+    return merged
 
-    If any ray fails, of these or of those at the rim of a lens with apertures, or an obstruction lies in the pupil,
-    2·order rings fill the clear parts of 8·order arms (`clear_pupil.arms_of`), 32·(order - 1) with an obstruction or a
-    polygon, whose corners then leave an error of 2e-4 at order 4.
+
+def _of_pairs(numbers: Tensor, light: Light) -> Tensor:
+    """Numbers (n, D, F, W, ...) of the pairs of a light, as its axes."""
+    return numbers.flatten(1, 2)[:, light.pairs].unflatten(1, light.valid.shape[:2])
+
+
+def trace_light(scene: Scene, order: int, fold: str) -> list[Light]:
+    """The rays of an order, of the part of the pupil that symmetry needs; then those of pairs whose beams are clipped.
+
+    If any ray of a pair of a distance and a field fails, of these or of those at the rim of a lens with apertures, or
+    an obstruction lies in the pupil, 2·order rings fill the clear parts of 8·order arms (`clear_pupil.arms_of`), 32·
+    (order - 1) with an obstruction or a polygon, whose corners then leave an error of 2e-4 at order 4. The clear parts
+    of all such pairs are searched at once; the rays of the others, and so their kernels, stay the same.
     """
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
-    count, is_hollow = 0, any(map(stands_inside, apertures))
+    lights, count, is_hollow = [], 0, any(map(stands_inside, apertures))
+    pairs: Tensor | None = None
     if not is_hollow:
         points, weights = fold_pupil(order, fold, scene.wavelengths)
         rim = (
@@ -458,12 +488,18 @@ def trace_light(scene: Scene, order: int, fold: str) -> Light:
         rays = trace_scene(scene, torch.cat([points, rim], 1))
         hits, valid = rays.position[:2], rays.valid
         inside, count = points.shape[1], points.shape[1] + rim.shape[1]
-        if scene.everywhere(valid.all()):
-            return Light(hits[..., :inside], valid[..., :inside], weights, count)
+        fails = ~valid.flatten(2).all(-1).flatten()
+        if not bool(fails.all()):
+            lights = [Light(hits[..., :inside], valid[..., :inside], weights, count)]
+            if not bool(fails.any()):
+                return lights
+            pairs = fails.nonzero()[:, 0]
+            scene = scene.of_pairs(pairs)
     arms = arms_of(scene, 32 * max(order - 1, 1) if is_hollow else 8 * order, fold)
     points, weights = arms.rule(2 * order)
     rays = trace_scene(scene, points)
-    return Light(rays.position[:2], rays.valid, weights, count + arms.rays + points.shape[-1], arms)
+    traced = count + arms.rays + points.shape[-1]
+    return [*lights, Light(rays.position[:2], rays.valid, weights, traced, arms, pairs)]
 
 
 def round_arms(order: int) -> int:

@@ -88,6 +88,7 @@ class Model:
     is_automatic: whether `model="auto"` tries it.
     row, compared: its row in `compare`, and the arguments of `psf` used there.
     by_field: whether decisions are made for each field alone: processes then share out whole fields.
+    by_pair: whether they are made for each pair of an object distance and a field: processes share out whole pairs.
     in_common: whether all kernels of a call have the sampling of the widest and of the least symmetric of them: it is
         called for each lens and object distance, and by cameras for each kernel, which so depend on no others.
 
@@ -114,6 +115,7 @@ class Model:
     row: int = 0
     compared: Mapping = dataclasses.field(default_factory=dict)
     by_field: bool = False
+    by_pair: bool = False
     in_common: bool = False
     by_width: bool = False
     proof: float | None = None
@@ -139,7 +141,7 @@ _ROWS = (
     Model(
         "gaussian", "Gaussian DRT", gaussian.kernels, (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), Gaussian,
         lean=gaussian.kernels_alone, of_points=gaussian.kernels_of_points, is_automatic=True, row=1,
-        compared={"tol": 1e-3}, by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
+        compared={"tol": 1e-3}, by_pair=True, by_width=True, proof=2.0, least=1e-4, most=0.6, margin=2.0, floor=1e-11,
     ),
     # All traced rays: geometric optics. Each order halves the error; an accidentally small change is not believed. The
     # table of rings for rotationally symmetric light (radial.py) is accurate to 1e-5.
@@ -161,8 +163,9 @@ MODELS = {row.name: row for row in _ROWS}
 
 
 def is_sampled_in_common(lens: Lens, model: str) -> bool:
-    """Whether the sampling of a kernel depends on the others of a call: of DRT, and where apertures may clip one."""
-    return MODELS[model].in_common or any(surface.apertures for surface in lens.surfaces)
+    """Whether the sampling of a kernel depends on the others of a call: of DRT, of waves that apertures may clip."""
+    row = MODELS[model]
+    return row.in_common or (row.by_field and any(surface.apertures for surface in lens.surfaces))
 
 
 class NotConverged(RaytraceWarning):
@@ -403,7 +406,7 @@ def _driver(
         row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **keywords)) if keywords else row
         if share is None:
             return row
-        deal = functools.partial(shared, share=share, by_field=row.by_field)
+        deal = functools.partial(shared, share=share, by_field=row.by_field, by_pair=row.by_pair)
         plain = row.plain and functools.partial(plain_rays_shared, row.plain, share)
         return dataclasses.replace(row, kernels=deal(row.kernels), lean=row.lean and deal(row.lean), plain=plain)
 
@@ -620,14 +623,17 @@ def check_shares(lens: Lens, parameters: Parameters | None) -> None:
         raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
 
 
-def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = False) -> Callable[..., Kernels]:
+def shared(
+    kernels: Callable[..., Kernels], share: Share, *, by_field: bool = False, by_pair: bool = False
+) -> Callable[..., Kernels]:
     """The same kernels, each process computing a block; all processes get all of them, without gradient.
 
-    by_field: decisions are made for each field alone: either whole fields are dealt out, or each field is divided.
+    by_field: decisions are made for each field alone: either whole fields are dealt out, or each field is divided;
+    by_pair: for each pair of an object distance and a field: its wavelengths stay together.
     """
 
     def compute(scene: Scene, grid: Grid, **options: Any) -> Kernels:
-        cut = _cuts(scene.shape, share.processes, by_field=by_field)
+        cut = _cuts(scene.shape, share.processes, by_field=by_field, by_pair=by_pair)
         if math.prod(cut) == 1:
             return kernels(scene, grid, **options)
         # Processes beyond the number of blocks repeat a block, so that all take part in all decisions.
@@ -673,12 +679,14 @@ def plain_rays_shared(plain: Callable[..., Kernels], share: Share, scene: Scene,
     )
 
 
-def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int, ...]:
+def _cuts(shape: Sequence[int], processes: int, *, by_field: bool, by_pair: bool = False) -> tuple[int, ...]:
     """Number of parts along each axis that minimises the largest block; of equal ones the fewest parts."""
     choices = itertools.product(*(range(1, min(count, processes) + 1) for count in shape))
     fitting = [cut for cut in choices if math.prod(cut) <= processes]
     if by_field:
         fitting = [cut for cut in fitting if cut[1] == 1 or cut[0] * cut[2] == 1]
+    if by_pair:
+        fitting = [cut for cut in fitting if cut[2] == 1]
     return min(
         fitting, key=lambda cut: (math.prod(-(-n // k) for n, k in zip(shape, cut, strict=True)), math.prod(cut))
     )

@@ -23,10 +23,10 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.maths.numerics import safe_divide, value
+from raytrace.maths.numerics import detached, in_transform, safe_divide, value
 from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.apertures import clearances_of, stands_inside
-from raytrace.system.lens import Lens, field_points
+from raytrace.system.lens import Lens, computed_once, field_points
 from raytrace.system.rays import Rays
 from raytrace.tracing.launch import with_ray_aiming
 from raytrace.tracing.scene import Scene, scene, trace_apertures, trace_scene
@@ -195,27 +195,38 @@ def arms_of(scene: Scene, count: int, fold: str = "none") -> Arms:
     polygon) they start at the centre of the pupil; if it does not cover the centre, the angles are of equal steps, and
     a second or third clear part of all arms follows the first ones.
     """
+    with computed_once():  # beams and media of the search
+        return _arms_of(scene, _still(scene), count, fold)
+
+
+def _still(scene: Scene) -> Scene:
+    """The scene without derivatives, for a search: its rays share beams and media. Not of a memo, which needs them."""
+    return scene if scene.memo is not None or in_transform() else detached(scene)
+
+
+def _arms_of(scene: Scene, still: Scene, count: int, fold: str) -> Arms:
+    """`arms_of`; still: the scene without derivatives."""
     like = scene.wavelengths
     around = 2 * math.pi if fold == "none" else math.pi
     apertures = [aperture for each in scene.apertures.values() for aperture in each]
     if fold == "round":
         unit, origin = like.new_tensor([[0.0], [1.0]]).reshape(2, 1, 1, 1, 1), like.new_zeros(2, *scene.shape)
         unit = unit.expand(2, *scene.shape, 1)
-        edges, traced = _enclosed(scene, unit, origin)
+        edges, traced = _enclosed(still, unit, origin)
         return _clear_parts(scene, origin, unit, torch.ones_like(unit[0]), edges, traced, _no_kinks(edges, 1))
     is_hollow = any(map(stands_inside, apertures))
     with torch.no_grad():
         origin, traced = like.new_zeros(2, *scene.shape), 0
         if not is_hollow:
             points, weights = gauss_rings(*_INNER, dtype=like.dtype, device=like.device)
-            passes = torch.where(trace_scene(scene, points).valid, weights, 0.0)
+            passes = torch.where(trace_scene(still, points).valid, weights, 0.0)
             origin = torch.stack([safe_divide((passes * part).sum(-1), passes.sum(-1)) for part in points])
             origin = torch.stack([torch.zeros_like(origin[0]), origin[1]]) if fold == "mirror" else origin
             traced = points.shape[1]
-    kinks, searched = _kinks(scene, origin, count, fold, is_hollow)
+    kinks, searched = _kinks(scene, still, origin, count, fold, is_hollow)
     angle, share = _angles(kinks.angle, count, around)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
-    edges, enclosing = _enclosed(scene, unit, origin)
+    edges, enclosing = _enclosed(still, unit, origin)
     return _clear_parts(scene, origin, unit, share, edges, traced + searched + enclosing, kinks)
 
 
@@ -255,7 +266,7 @@ def _moved(scene: Scene, arms: Arms) -> tuple[Arms, Tensor]:
     origin = arms.origin.expand(2, *scene.shape)
     if kinks.angle.shape[-1]:
         start = kinks.radius, kinks.angle.nan_to_num(posinf=0.0)
-        angle, _ = _crossing(scene, origin, start, kinks.pair, _NEARBY)
+        angle, _ = _crossing(scene, _still(scene), origin, start, kinks.pair, _NEARBY)
         kinks = dataclasses.replace(kinks, angle=torch.where(kinks.angle.isfinite(), angle, torch.inf))
     angle, share = _angles(kinks.angle, kinks.count, 2 * math.pi)
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])
@@ -337,21 +348,22 @@ def _no_kinks(edges: Edges, count: int) -> Kinks:
     return Kinks(none, none, edges.number[..., :0], count)
 
 
-def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool) -> tuple[Kinks, int]:
+def _kinks(scene: Scene, still: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool) -> tuple[Kinks, int]:
     """Where another edge begins to bound the clear pupil, or blocked arms begin, for `count` arms.
 
-    No kinks if an arm has several clear parts. Also returns the number of rays traced for each kernel.
+    No kinks of a kernel of which an arm has several clear parts. Also returns the number of rays traced for each one.
     """
     is_whole = fold == "none"
     coarse = _COARSE if is_whole else _COARSE // 2
     step = 2 * math.pi / _COARSE
     angle = (torch.arange(coarse, dtype=origin.dtype, device=origin.device) + 0.5) * step
     unit = torch.stack([torch.sin(angle), torch.cos(angle)])[:, None, None, None].expand(2, *scene.shape, -1)
-    edges, traced = _enclosed(scene, unit, origin)
+    edges, traced = _enclosed(still, unit, origin)
     kinks = [_no_kinks(edges, count)]
-    if edges.exists.shape[-1] > coarse:
-        return kinks[0], traced
-    (inner, outer), (number_in, number_out), exists = edges.radius, edges.number, edges.exists
+    is_simple = ~edges.exists[..., coarse:].any(-1, keepdim=True)
+    (inner, outer), (number_in, number_out), exists = (
+        t[..., :coarse] for t in (edges.radius, edges.number, edges.exists)
+    )
     exists_after = exists.roll(-1, -1)
     changes = []
     for radius, number in ((inner, number_in), (outer, number_out))[0 if is_hollow else 1 :]:
@@ -362,6 +374,7 @@ def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool)
     radius, number, other = (torch.where(exists, t, t.roll(-1, -1)) for t in ends)
     changes.append(((exists != exists_after) & (number >= 0), radius, number, other))
     for change, radius, number, other in changes:
+        change = change & is_simple
         if not is_whole:
             change = torch.cat([change[..., :-1], torch.zeros_like(change[..., :1])], -1)
         most = int(change.sum(-1).max())
@@ -370,14 +383,14 @@ def _kinks(scene: Scene, origin: Tensor, count: int, fold: str, is_hollow: bool)
         order = change.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., :most]
         pair = torch.stack([number.gather(-1, order), other.gather(-1, order)]).clamp_min(0)
         start = radius.gather(-1, order), angle[order] + 0.5 * step
-        kink, rays = _crossing(scene, origin, start, pair, step)
+        kink, rays = _crossing(scene, still, origin, start, pair, step)
         traced += rays
         kinks.append(Kinks(torch.where(change.gather(-1, order), kink, torch.inf), start[0], pair, count))
     return pytree.tree_map(lambda *parts: torch.cat(parts, -1), *kinks), traced
 
 
 def _crossing(
-    scene: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float
+    scene: Scene, still: Scene, origin: Tensor, start: tuple[Tensor, Tensor], pair: Tensor, step: float
 ) -> tuple[Tensor, int]:
     """Angle (D, F, W, K) where two clearances (2, D, F, W, K) vanish together, near a radius and an angle; and rays."""
     radius, angle = start
@@ -387,7 +400,7 @@ def _crossing(
     with torch.no_grad():
         for _ in range(_NEWTON):
             shifted = here[..., None] + shifts
-            values = _clearances_at(scene, shifted.flatten(-2)).unflatten(-1, (-1, 3))
+            values = _clearances_at(still, shifted.flatten(-2)).unflatten(-1, (-1, 3))
             c = values.gather(0, pair[..., None].expand(*pair.shape, 3))  # (2, D, F, W, K, 3)
             differences = c[..., 1:] - c[..., :1]
             here = here - _newton(c[..., 0], differences, small).clamp(-step, step)

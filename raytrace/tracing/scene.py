@@ -103,8 +103,8 @@ class Memo:
         numbers: of surfaces whose points are requested; then the rays have no paths, and no aperture stops them.
         """
         distance, pupil = bundle[0].surfaces[0].thickness, bundle[3]
-        # Where rays fail, each object distance may have its own pupil points.
-        if self._range is not None and distance.dim() == 4 and (pupil.dim() == 2 or pupil.shape[1] == 1):
+        # Where rays fail, each object distance has its own pupil points.
+        if self._range is not None and distance.dim() == 4 and pupil.dim() == 2:
             low, high = self._range
             if bool(((distance >= low) & (distance <= high)).all()):
                 front = self._find_or_trace(_at_nodes(bundle, self._range), numbers, judge=_is_smooth)
@@ -305,6 +305,18 @@ class Scene:
         """The scene of some of the object distances or lenses."""
         fields = self.fields if self.fields.dim() == 2 else self.fields[:, distances]
         return dataclasses.replace(self, lens=one_lens(self.lens, distances), fields=fields)
+
+    def of_pairs(self, numbers: Tensor) -> "Scene":
+        """The scene of K pairs of an object distance, or lens, and a field: (K, 1, W), of one distance (1, K, W).
+
+        numbers: (K,) of the pairs, d F + f.
+        """
+        count, fields, _ = self.shape
+        distance, field = numbers // fields, numbers % fields
+        places = self.fields[:, field] if self.fields.dim() == 2 else self.fields[:, distance, field]
+        if count == 1:
+            return dataclasses.replace(self, fields=places)
+        return dataclasses.replace(self, lens=one_lens(self.lens, distance), fields=places[..., None])
 
     def everywhere(self, condition: Tensor) -> bool:
         """Whether a condition () holds in all of the whole scene."""
