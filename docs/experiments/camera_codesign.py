@@ -6,12 +6,12 @@
 
 `models`: step 1 of the first work with Gaussian and with DRT PSFs, and with the lens of the file frozen, in `--steps`
 steps each; all curvatures and air spaces of each of `--lenses`. `apart`: the lens of the file, one of least spots and
-one of the closed form (DRT PSFs, by `lm`, from the least spots), each with a network trained behind it and with both trained
-further, against training of both from the start. Every training of `apart` has `--seconds` of processor time, lens and
-network together: its number of steps follows from the measured time of a step. Step 2 freezes the lens and trains the
-network further with DRT PSFs; the test takes held-out photographs at the middle, at 0.7 and at the corner of the
-sensor. A second call resumes. `pictures` draws the scene, the record of the sensor and its restorations, by the camera
-that `apart` trained together first.
+one of the closed form (DRT PSFs, by `lm`, from the least spots), each with a network trained behind it and with both
+trained further, against training of both from the start. Every training of `apart` has `--seconds` of processor time,
+lens and network together: its number of steps follows from the measured time of a step. Step 2 freezes the lens and
+trains the network further with DRT PSFs; the test takes held-out photographs at the middle, at 0.7 and at the corner of
+the sensor. A second call resumes. `pictures` draws the scene, the record of the sensor and its restorations, by the
+camera that `apart` trained together first.
 """
 
 import argparse
