@@ -241,6 +241,8 @@ def test_perturbed_cameras_of_the_test_are_the_same_for_all_trainings(lens, pict
     again = errors_as_built(other, pictures, nominal)
     assert torch.equal(torch.stack(again), torch.stack(found))  # of the same, untrained camera
     assert float(found[0].std()) > 0
+    others = errors_as_built(built, pictures, settings, set_number=1)
+    assert not set(others[0].tolist()) & set(found[0].tolist())
 
 
 def test_grades_of_the_settings_are_those_of_tolerancing():

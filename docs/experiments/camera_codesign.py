@@ -4,12 +4,14 @@
     python docs/experiments/camera_codesign.py apart --data DIR -o FOLDER --docs docs
     python docs/experiments/camera_codesign.py pictures --data DIR -o FOLDER --docs docs
 
-`models`: step 1 of the first work with Gaussian and with DRT PSFs, of three lenses, all curvatures and air spaces.
-`apart`: a lens for its spot size and one for the closed form, each with a network trained behind it, against training
-of both together. Every training has `--seconds` of processor time, lens and network together: its number of steps
-follows from the measured time of a step. Step 2 freezes the lens and trains the network further with DRT PSFs; the test
-takes held-out photographs at the middle, at 0.7 and at the corner of the sensor. A second call resumes. `pictures`
-draws the scene, the record of the sensor and its restorations, by the camera that `apart` trained together first.
+`models`: step 1 of the first work with Gaussian and with DRT PSFs, and with the lens of the file frozen, in `--steps`
+steps each; all curvatures and air spaces of each of `--lenses`. `apart`: the lens of the file, one of least spots and
+one of the closed form (DRT PSFs, by `lm`, from the least spots), each with a network trained behind it and with both
+trained further, against training of both from the start. Every training of `apart` has `--seconds` of processor time,
+lens and network together: its number of steps follows from the measured time of a step. Step 2 freezes the lens and
+trains the network further with DRT PSFs; the test takes held-out photographs at the middle, at 0.7 and at the corner of
+the sensor. A second call resumes. `pictures` draws the scene, the record of the sensor and its restorations, by the
+camera that `apart` trained together first.
 """
 
 import argparse
@@ -31,7 +33,6 @@ import raytrace as rt
 from raytrace.files import write_json, write_text
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.closed_form import (
-    camera_error,
     even_distances,
     field_filters,
     optimise_closed_form,
@@ -80,15 +81,18 @@ REFINED = 80  # steps of step 2
 SEEDS = range(5)
 SHOWN = 9e3  # mm, object distance of the pictures
 TESTED = 7  # distances of the test, even in their reciprocal
-DISTANCES = 5  # of the closed form, which has half of the time
+DISTANCES = 5  # of the closed form
+CYCLES = 6  # of the closed form, of DRT PSFs
 ARMS = {
-    "models": ("gaussian", "drt"),
-    "apart": ("spot", "closed form", "closed form, together", "together"),
+    "models": ("gaussian", "drt", "frozen"),
+    "apart": ("file", "spot", "spot, together", "closed form", "closed form, together", "together"),
 }
+FROZEN = "frozen", "file", "spot", "closed form"
+REFERENCE = {"models": "drt", "apart": "together"}
 WORDS = {
-    "gaussian": "Gaussian DRT", "drt": "DRT", "spot": "least spots, then network",
-    "closed form": "closed form, then network", "closed form, together": "closed form, then both",
-    "together": "both from the start",
+    "gaussian": "Gaussian DRT", "drt": "DRT", "frozen": "lens of the file", "file": "lens of the file, network",
+    "spot": "least spots, network", "spot, together": "least spots, both", "closed form": "closed form, network",
+    "closed form, together": "closed form, both", "together": "both from the start",
 }  # fmt: skip
 
 
@@ -99,15 +103,12 @@ class Study:
     kind: str
     folder: Path
     seconds: float
+    steps: int
+    lenses: tuple[str, ...]
     pictures: Pictures
 
-    @property
-    def lenses(self) -> list[str]:
-        return [*LENSES] if self.kind == "models" else ["cooke_triplet"]
-
     def settings(self, lens: str, arm: str, seed: int) -> CodesignSettings:
-        model = arm if self.kind == "models" else "gaussian"  # also of pictures
-        return dataclasses.replace(BASE, **LENSES[lens], model=model, seed=seed)
+        return dataclasses.replace(BASE, **LENSES[lens], model="drt" if arm == "drt" else "gaussian", seed=seed)
 
 
 def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, *, frozen: bool, count: int = 6) -> float:
@@ -149,42 +150,45 @@ def trained_camera(study: Study, lens: Lens, name: str, arm: str, seed: int) -> 
     settings = study.settings(name, arm, seed)
     train_pictures, _ = split(study.pictures, seed=seed)
     folder = study.folder / name / arm.replace(" ", "_").replace(",", "") / str(seed)
-    left, spent = study.seconds, 0.0
-    frozen = arm in ("spot", "closed form")
-    if arm == "spot":
+    spent, frozen = 0.0, arm in FROZEN
+    if arm.startswith(("spot", "closed form")):
         lens, spent = for_spots(lens, settings)
     one = initial_camera(lens, settings)
     if arm.startswith("closed form"):
         stored = folder / "closed_form.pt"
         if not stored.exists():
-            spectrum = spectrum_of(train_pictures, settings)
-            about = {"distances": even_distances(one, DISTANCES, spread=settings.spread)}
-            camera_error(one, spectrum, about["distances"]).backward()  # plans the PSFs
-            start = time.process_time()
-            camera_error(one, spectrum, about["distances"]).backward()
-            each = time.process_time() - start
-            one.variables.zero_grad()
-            start = time.process_time()
-            optimise_closed_form(one, spectrum, **about, steps=max(1, round(0.5 * left / (1.2 * each))))
+            spectrum, start = spectrum_of(train_pictures, settings), time.process_time()
+            distances = even_distances(one, DISTANCES, spread=settings.spread)
+            one.use("drt")
+            one.plan()
+            optimise_closed_form(one, spectrum, distances=distances, steps=CYCLES, optimizer="lm")
+            one.use(settings.model)
             folder.mkdir(parents=True, exist_ok=True)
             torch.save({"seconds": time.process_time() - start, "variables": one.variables.state_dict()}, stored)
         content = torch.load(stored, weights_only=True)
         one.variables.load_state_dict(content["variables"])
-        spent = content["seconds"]
+        spent += content["seconds"]
     one.variables.requires_grad_(not frozen)
-    each_file = study.folder / f"{name}, {'frozen' if frozen else arm if study.kind == 'models' else 'both'}.json"
-    if not each_file.exists():
-        write_json(each_file, {"seconds": step_seconds(lens, train_pictures, settings, frozen=frozen)})
-    each = read_json(each_file)["seconds"]
-    per_epoch = steps_per_epoch(train_pictures, settings)
-    epochs = max(1, round((left - spent) / each / per_epoch))
-    settings = dataclasses.replace(settings, epochs=epochs)
+    per_epoch, epochs = steps_per_epoch(train_pictures, settings), 0
+    if study.kind == "models":
+        epochs = round(study.steps / per_epoch)
+    else:
+        each_file = study.folder / f"{name}, {'frozen' if frozen else 'both'}.json"
+        if not each_file.exists():
+            write_json(each_file, {"seconds": step_seconds(lens, train_pictures, settings, frozen=frozen)})
+        epochs = max(1, round((study.seconds - spent) / read_json(each_file)["seconds"] / per_epoch))
+    settings, measured = dataclasses.replace(settings, epochs=epochs), folder / "seconds.json"
     one.plan()
-    for _ in optimise(
-        one, train_pictures, settings, Run(folder / "step1", {**dataclasses.asdict(settings), "arm": arm})
-    ):
-        pass
-    return one, {"steps": epochs * per_epoch, "seconds": spent + epochs * per_epoch * each, "folder": folder}
+    start, before = time.process_time(), read_json(measured)["seconds"] if measured.exists() else 0.0
+    run = Run(folder / "step1", {**dataclasses.asdict(settings), "arm": arm})
+    for _ in optimise(one, train_pictures, settings, run):
+        write_json(measured, {"seconds": before + time.process_time() - start})
+    return one, {
+        "steps": epochs * per_epoch,
+        "lens_seconds": spent,
+        "seconds": spent + read_json(measured)["seconds"],
+        "folder": folder,
+    }
 
 
 # -- step 2 and the test, with DRT PSFs of the frozen lens
@@ -270,6 +274,7 @@ def row_of(study: Study, name: str, arm: str, seed: int) -> dict:
         "training": arm,
         "seed": seed,
         "steps": about["steps"],
+        "lens_seconds": about["lens_seconds"],
         "seconds": about["seconds"],
         **measured,
     }
@@ -296,7 +301,7 @@ def draw(study: Study, rows: list[dict], reference: str):
     """Differences of PSNR from the reference, of every seed, with the mean and its interval."""
     arms = [arm for arm in ARMS[study.kind] if arm != reference]
     panels = [(lens, arm) for lens in study.lenses for arm in arms]
-    figure = new_figure(1.2 + 2.1 * len(panels), 3.4)
+    figure = new_figure(1.2 + 1.9 * len(panels), 3.4)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     keys = {f"{kind}_{place:g}": (kind, place) for kind in ("network", "wiener") for place in PLACES}
     for axis, (lens, arm) in zip(axes, panels, strict=True):
@@ -371,7 +376,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", required=True, help="folder of colour photographs")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--docs", type=Path, help="folder for the table and the figure")
-    parser.add_argument("--seconds", type=float, default=60.0, help="processor time of a training")
+    parser.add_argument("--seconds", type=float, default=40.0, help="processor time of a training of `apart`")
+    parser.add_argument("--steps", type=int, default=60, help="of a training of `models`")
+    parser.add_argument("--lenses", nargs="+", choices=[*LENSES], default=["double_gauss", "cooke_triplet"])
     parser.add_argument("--seeds", type=int, default=len(SEEDS))
 
 
@@ -383,12 +390,16 @@ def main() -> None:
     prepare()
     warnings.filterwarnings("ignore", category=UserWarning)
     pictures = read(files(arguments.data), least=BASE.patch + BASE.size - 1, colour=True)
-    study = Study(arguments.study, arguments.output / arguments.study, arguments.seconds, pictures)
+    lenses = tuple(arguments.lenses) if arguments.study == "models" else ("cooke_triplet",)
+    study = Study(
+        arguments.study, arguments.output / arguments.study, arguments.seconds, arguments.steps, lenses, pictures
+    )
     if arguments.study == "pictures":
         draw_pictures(study).savefig(arguments.docs / "camera_pictures.png")
         return
     study.folder.mkdir(parents=True, exist_ok=True)
-    about = {"pictures": digest(pictures.samples), "seconds": arguments.seconds}
+    budget = {"steps": arguments.steps} if arguments.study == "models" else {"seconds": arguments.seconds}
+    about = {"pictures": digest(pictures.samples), **budget}
     Run(study.folder / "about", about)
     rows = []
     for seed in range(arguments.seeds):
@@ -396,7 +407,7 @@ def main() -> None:
             for arm in ARMS[study.kind]:
                 rows.append(row_of(study, name, arm, seed))
                 print(json.dumps(rows[-1]), flush=True)
-    reference = "drt" if study.kind == "models" else "together"
+    reference = REFERENCE[study.kind]
     for name in study.lenses:
         for arm in ARMS[study.kind]:
             if arm != reference:

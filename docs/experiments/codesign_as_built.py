@@ -1,10 +1,10 @@
-"""A study of co-design as built: training on perturbed lenses against nominal training, at equal processor time.
+"""A study of co-design as built: training on perturbed lenses against nominal training, in equal numbers of steps.
 
     python docs/experiments/codesign_as_built.py double_gauss --data DIR -o FOLDER --docs docs
 
-Of every seed, `--start` epochs on the nominal lens are the common start. From there each training has `--seconds` of
-processor time: its number of steps follows from the measured time of a step. All are tested on the same perturbed
-cameras, which no training sees; differences are paired by seed. A second call resumes, and computes what is missing.
+Of every seed, `--start` epochs on the nominal lens are the common start. From there each training takes `--steps`. The
+trainings of a seed are tested on the same perturbed cameras, which no training and no other seed sees; differences are
+paired by seed. A second call resumes, and computes what is missing.
 """
 
 import argparse
@@ -20,8 +20,6 @@ from scipy.stats import t as student
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
 from raytrace.imaging.codesign import (
-    Batches,
-    absolute_error,
     errors_as_built,
     initial_camera,
     optimise,
@@ -32,7 +30,6 @@ from raytrace.imaging.training import Run, load_state, read_json, read_state
 from raytrace.io import as_lens
 from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, new_figure
 from raytrace.settings import CodesignSettings
-from raytrace.shards import Share
 from raytrace.system.lens import Lens
 from raytrace.tracing.compiled import prepare
 
@@ -48,27 +45,13 @@ BUILDS = {
 }
 MEASURES = {"l1": "mean L¹", "psnr": "PSNR, dB"}
 _CHECK = 6  # cameras of the test with DRT PSFs
+_PATCHES = 240  # of the test, recorded by every camera
 
 
 def settings_of(training: str, seed: int) -> CodesignSettings:
     """Of a training on the nominal lens, or on those of a build."""
     grade, refocus = BUILDS.get(training, ("", "sensor"))
     return dataclasses.replace(BASE, as_built=bool(grade), grade=grade, refocus=refocus, seed=seed)
-
-
-def step_seconds(lens: Lens, pictures: Pictures, settings: CodesignSettings, count: int = 8) -> float:
-    """Median processor time of a training step, s."""
-    trained = initial_camera(lens, settings)
-    trained.plan()
-    batches = Batches(pictures, settings, trained.tolerances if settings.as_built else None)
-    optimizer, seconds = torch.optim.Adam(trained.parameters(), 0.0), []
-    for step in range(count + 2):
-        start = time.process_time()
-        optimizer.zero_grad(set_to_none=True)
-        (absolute_error(trained, batches(step, Share())).mean() + trained.variables.violation()).backward()
-        optimizer.step()
-        seconds.append(time.process_time() - start)
-    return float(np.median(seconds[2:]))
 
 
 def train_one(
@@ -102,8 +85,8 @@ def tested(lens: Lens, pictures: Pictures, settings: CodesignSettings, folder: P
     path = folder / f"{file_name(build)}_{psf}.json"
     if not path.exists():
         built = restored(lens, settings, folder, build, psf)
-        of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=16)
-        l1, ratio = errors_as_built(built, pictures, of_test)
+        of_test = dataclasses.replace(settings, cameras=_CHECK if psf == "drt" else settings.cameras, batch=_PATCHES)
+        l1, ratio = errors_as_built(built, pictures, of_test, set_number=settings.seed)
         write_json(path, {"l1": l1.tolist(), "psnr": ratio.tolist()})
     found = {name: np.array(numbers) for name, numbers in read_json(path).items()}
     return {
@@ -179,11 +162,11 @@ def save(rows: list[dict], drawn, stem: Path) -> None:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lens")
     parser.add_argument("--data", required=True, help="folder of pictures")
-    parser.add_argument("--limit", type=int, default=200, help="pictures, evenly spaced")
+    parser.add_argument("--limit", type=int, help="use so many pictures, evenly spaced")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the trainings")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
-    parser.add_argument("--start", type=int, default=4, help="epochs of the common start")
-    parser.add_argument("--seconds", type=float, default=15.0, help="processor time of a training from there")
+    parser.add_argument("--start", type=int, default=1, help="epochs of the common start")
+    parser.add_argument("--steps", type=int, default=120, help="of a training from there, in whole epochs")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--builds", nargs="+", default=["precision", "commercial"], choices=[*BUILDS])
     parser.add_argument("--check", action="store_true", help="test with DRT PSFs as well")
@@ -200,21 +183,14 @@ def main(words: list[str] | None = None) -> None:
     of_training, of_test = split(pictures)
     about = {"lens": chosen.lens, "pictures": digest(pictures.samples)}
     chosen.folder.mkdir(parents=True, exist_ok=True)
-    measured = chosen.folder / "steps.json"
-    costs = read_json(measured) if measured.exists() else {}
     trainings = ["nominal", *chosen.builds]
-    for training in trainings:
-        if training not in costs:
-            costs[training] = step_seconds(lens, of_training, settings_of(training, 0))
-            write_json(measured, costs)
-            print(f"{training}: {costs[training]:.3f} s a step", flush=True)
     per_epoch, spent = steps_per_epoch(of_training, BASE), {}
     for seed in range(chosen.seeds):
         start = chosen.folder / f"start_{seed}"
         settings = dataclasses.replace(settings_of("nominal", seed), epochs=chosen.start, decay="none")
         train_one(lens, of_training, settings, start, about)
         for training in trainings:
-            epochs = max(1, round(chosen.seconds / costs[training] / per_epoch))
+            epochs = max(1, round(chosen.steps / per_epoch))
             settings = dataclasses.replace(settings_of(training, seed), epochs=epochs)
             folder = chosen.folder / f"{file_name(training)}_{seed}"
             seconds = train_one(lens, of_training, settings, folder, about, start)

@@ -1,16 +1,38 @@
 """The claims of the published study of the double Gauss, compared with finished runs.
 
-A claim is a row (text, criterion, function that judges it).
+    python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2   # claims.csv of a table.csv
+
+A claim is a row (text, criterion, function that judges it). A table.csv has a row for each model and seed: losses, foci
+and sensor distance, and the loss after step 2 at every object distance. It says nothing about the course of training
+and about times, whose claims are left unanswered.
 """
 
+import argparse
+import csv
 import dataclasses
 import math
+import re
 import statistics
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 
-from codesign_study import NAMES, StepTime, Summary, loss_increase, losses_by_distance, percent, summaries
+import torch
+from codesign_study import (
+    NAMES,
+    StepTime,
+    StudyOutcome,
+    Summary,
+    blur_diameters,
+    loss_increase,
+    losses_by_distance,
+    percent,
+    summaries,
+)
 
-from raytrace.imaging.codesign import Outcome
+import raytrace as rt
+from raytrace.files import write_table
+from raytrace.imaging.codesign import Outcome, lens_at_start
+from raytrace.settings import CodesignSettings
 from raytrace.system.lens import Lens
 
 #: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
@@ -318,3 +340,48 @@ CLAIMS = (
     ),
     ("A Gaussian DRT costs less than the DRT", "PSFs and gradient of a batch: at least 10 % below", _ours_cheaper),
 )
+
+
+# -- of a table
+
+
+def outcomes_of(path: Path) -> list[StudyOutcome]:
+    """The runs of a table.csv."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    runs = []
+    for row in rows:
+        numbers = {key: float(value) for key, value in row.items() if key not in ("model", "seed")}
+        at = {key: float(found[1]) * 1e3 for key in numbers if (found := re.fullmatch(r"l1_([\d.]+)m", key))}
+        by_distance = {f"{z:g}": numbers.pop(key) for key, z in at.items()}
+        runs.append(StudyOutcome(row["model"], int(row["seed"]), **numbers, variables={}, by_distance=by_distance))
+    return runs
+
+
+def blur_of(runs: Sequence[Outcome], f_number: float) -> Measurements:
+    """RMS blur of the double Gauss at the sensor distances of the runs, at objects every metre."""
+    lens, usual = rt.read_lens("double_gauss"), CodesignSettings(f_number=f_number)
+    distances, found = torch.arange(10, 51, dtype=torch.float64), {}
+    for run in runs:
+        focused = lens_at_start(lens, dataclasses.replace(usual, start=repr(run.sensor_mm)))
+        found.setdefault(run.model, []).append(blur_diameters(focused, 1e3 * distances).tolist())
+    blur = {model: [statistics.fmean(column) for column in zip(*each, strict=True)] for model, each in found.items()}
+    return Measurements(tuple(distances.tolist()), blur, {})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="of table.csv; claims.csv is written there")
+    parser.add_argument("--f-number", metavar="N", type=float, required=True, help="aperture of the runs")
+    arguments = parser.parse_args()
+    runs = outcomes_of(arguments.folder / "table.csv")
+    judged = claims(runs, [], blur_of(runs, arguments.f_number), pending=())
+    rows = [
+        {"claim": one.text, "answer": one.answer, "figures": one.figures, "criterion": one.criterion} for one in judged
+    ]
+    write_table(arguments.folder / "claims.csv", rows)
+    print("\n".join(f"{one.answer:>14}: {one.text}; {one.figures}" for one in judged))
+
+
+if __name__ == "__main__":
+    main()

@@ -522,19 +522,23 @@ def errors_as_built(
     pictures: Pictures,
     settings: CodesignSettings,
     *,
+    set_number: int = 0,
     progress: Callable[[Sequence[int]], Iterable[int]] = iter,
 ) -> tuple[Tensor, Tensor]:
     """Mean |restored - picture| (C,) and PSNR (C,) dB of the mean square error, of perturbed cameras
     that training never draws.
 
     All cameras record the same batch of test samples; their errors are the same for all seeds and trainings.
-    progress: wraps the numbers of the cameras, for a bar.
+    set_number: of sets of other cameras. progress: wraps the numbers of the cameras, for a bar.
     """
     count, pixels = len(pictures) * settings.crops, settings.patch**2
     samples = make_batch(pictures, settings, list(range(min(settings.batch, count))), TEST_EPOCH)
     if camera.tolerances is None:
         raise ValueError("errors as built of a camera without tolerances: give as_built, grade or limits")
-    drawn, means = draw_errors(camera.tolerances, settings.cameras, first=_FIRST_TEST_TRIAL), []
+    drawn, means = (
+        draw_errors(camera.tolerances, settings.cameras, first=_FIRST_TEST_TRIAL + set_number * settings.cameras),
+        [],
+    )
     for number in progress(range(settings.cameras)):
         of_lens = dataclasses.replace(samples, errors=drawn[number])
         sums = _summed(camera, of_lens, lambda difference: difference.abs(), lambda difference: difference.square())
