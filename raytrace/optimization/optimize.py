@@ -110,10 +110,10 @@ def optimize(
     each; test_plates: a list (.csv, `stock.plates.read_plates`), from which each variable radius takes a value likewise
     (`optimization.fitting`); `Optimized.fitted` reports both.
     log: a file with a line for every cycle; checkpoint: a file (.json) of the state of the descent; resume: such a file
-    of the same lens, variables and merit function, from which the descent resumes bit-identically (with real ray aiming,
-    whose rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start. watch: invoked
-    after each cycle, except those of the choice of glasses, with its report and lens, while the system is opened the
-    best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
+    of the same lens, variables and merit function, from which the descent resumes bit-identically (with real ray
+    aiming, whose rays start from those of the last cycle, to 1e-10 of the merit), cycles counted from its start.
+    watch: invoked after each cycle, except those of the choice of glasses, with its report and lens, while the system
+    is opened the best one. Ctrl-C, or a KeyboardInterrupt that `watch` raises, ends with the best lens.
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable), and for spots that are more than 1.5 times as large between the fields, wavelengths or rays
