@@ -186,7 +186,14 @@ def test_a_telecentric_relay_has_the_pupils_and_the_magnification_of_first_order
         diameters = data.exit_pupil_diameter.flatten()
         assert diameters.tolist() == pytest.approx(len(diameters) * [2 * slope * (distance - 50)], rel=1e-4)
     assert main(["info", str(Path(__file__).parent / "cases" / "telecentric.zmx")]) == 0
-    assert re.search(r"telecentric +in object and image space", capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert re.search(r"telecentric +in object and image space", printed)
+    assert re.search(
+        r"exit pupil position +telecentric +mm, from the image; 2.146e\+06 mm by first-order data", printed
+    )
+    assert re.search(r"effective focal length +afocal +mm", printed)
+    assert rt.info(lens).document()["afocal"]
+    assert not rt.info("double_gauss").document()["afocal"]
     assert rt.info(lens).document()["telecentric"] == ["object", "image"]
     assert rt.info(rt.read_lens("double_gauss")).document()["telecentric"] == []
 

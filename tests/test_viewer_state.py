@@ -222,6 +222,14 @@ def test_solves_of_the_file_hold_and_configurations_keep_their_numbers(triplet):
 # -- numbers
 
 
+def test_pupils_at_infinity_are_telecentric():
+    """A lens of 50 mm behind a stop in its front focal point."""
+    rows = [dict(thickness=50), dict(radius=50, thickness=0, glass=1.5), dict(radius=-50, thickness=50)]
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=5, fields=[0, 5], wavelengths=[0.55])
+    words = {one["name"]: one.get("words") for one in compute.first_order_of(lens)}
+    assert {name: word for name, word in words.items() if word} == {"exit pupil": "telecentric"}
+
+
 @pytest.mark.filterwarnings("ignore::raytrace.tracing.launch.UnfilledStop")
 @pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss"])
 def test_numbers_of_a_refresh_are_those_of_the_library(name):
@@ -233,6 +241,8 @@ def test_numbers_of_a_refresh_are_those_of_the_library(name):
     values = {one["name"]: one["value"] for one in found["first_order"]}
     assert values["EFL"] == float(paraxial.effective_focal_length)
     assert values["F/#"] == float(paraxial.f_number)
+    assert values["exit pupil"] == float(paraxial.exit_pupil_position)
+    assert not any("words" in one for one in found["first_order"])
     spots = rt.spot(lens, fields=fields)
     assert found["spots"]["rms"] == pytest.approx((1e3 * spots.whole.rms_radius).tolist(), rel=1e-7)
     fan = rt.ray_fan(lens, fields=fields, points=compute.FAN)

@@ -28,7 +28,7 @@ from raytrace.tracing.geometry import (
     warn_of_defects,
 )
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.paraxial import LINES, first_order
+from raytrace.tracing.paraxial import LINES, at_infinity, first_order, telecentric_spaces
 from raytrace.tracing.trace import aiming_of
 
 #: Descriptions of phases and sag terms with their numbers; others are described by their class alone.
@@ -168,7 +168,8 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
-            "telecentric": _telecentric(lens),
+            "telecentric": telecentric_spaces(lens),
+            "afocal": "effective_focal_length" in at_infinity(lens),
             "ray_aiming": lens.ray_aiming,
             "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
@@ -208,8 +209,13 @@ class Info(Result):
 
     def quantities(self) -> list[tuple[str, str, str]]:
         """First-order data: quantity, value, and unit or definition."""
-        figures = zip(FIRST_ORDER_LINES, _figures(detached(self.lens)), strict=True)
-        return [(words, _quantity(figure), unit) for (words, _, unit), figure in figures]
+        lens = detached(self.lens)
+        infinite, lines = at_infinity(lens), []
+        for (words, name, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
+            is_computed = name in infinite and math.isfinite(figure)
+            remark = f"; {figure:.4g} mm by first-order data" if is_computed else ""
+            lines.append((words, infinite.get(name, _quantity(figure)), unit + remark))
+        return lines
 
     def base_ray_quantities(self) -> list[tuple[str, str, str, str]]:
         """Data about the axial chief ray of a lens whose axis bends or whose sections differ: quantity, tangential,
@@ -217,7 +223,12 @@ class Info(Result):
         lens = detached(self.lens)
         if is_round_about_axis(lens) or not bool((base := base_ray(lens)).valid):  # the sections agree in the former
             return []
-        pairs = [(words, map(_quantity, getattr(base, name).tolist()), unit) for words, name, unit in BASE_RAY_LINES]
+        infinite = at_infinity(lens)
+        infinite |= {"focal_length": infinite["effective_focal_length"]} if "effective_focal_length" in infinite else {}
+        pairs = [
+            (words, [infinite.get(name, _quantity(figure)) for figure in getattr(base, name).tolist()], unit)
+            for words, name, unit in BASE_RAY_LINES
+        ]
         return [(words, tangential, sagittal, unit) for words, (tangential, sagittal), unit in pairs]
 
     def scene(self) -> list[tuple[str, str]]:
@@ -233,7 +244,7 @@ class Info(Result):
         primary = f"  (* primary: number {lens.primary_wavelength})" if several else ""
         return [
             ("wavelengths", f"{shown} µm{primary}"),
-            *([("telecentric", f"in {' and '.join(spaces)} space")] if (spaces := _telecentric(lens)) else []),
+            *([("telecentric", f"in {' and '.join(spaces)} space")] if (spaces := telecentric_spaces(lens)) else []),
             ("ray aiming", aiming),
             *([("configuration", " of ".join(map(str, which.values())))] if which else []),
             ("fields", f"{points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}"),
@@ -314,15 +325,6 @@ def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
     data, real = first_order(lens), working_f_number(lens)
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
-
-
-def _telecentric(lens: Lens) -> list[str]:
-    """The spaces in which chief rays are parallel: the pupil is at least a thousand lengths of the lens away."""
-    data = first_order(lens)
-    far = 1e3 * max(sum(abs(float(surface.thickness)) for surface in lens.surfaces[1:-1]), 1.0)
-    object_space = lens.fields.telecentric or abs(float(data.entrance_pupil_position)) > far
-    image_space = abs(float(data.exit_pupil_position)) > far
-    return [*["object"] * object_space, *["image"] * image_space]
 
 
 def _base_ray_document(lens: Lens) -> dict:

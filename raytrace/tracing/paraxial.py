@@ -458,6 +458,35 @@ def at_magnification(lens: Lens, magnification: Tensor | float, *, keep_sensor: 
     return lens if keep_sensor else with_sensor_distance(lens, image.reshape(shape))
 
 
+#: Pupils so many lengths of the lens away are at infinity, and focal lengths so many are those of an afocal lens.
+_FAR, _AFOCAL = 1e3, 1e4
+
+
+def at_infinity(lens: Lens) -> dict[str, str]:
+    """Entries of FirstOrder that are infinite in practice, and the word of it.
+
+    effective_focal_length: "afocal", and both focal distances "infinite"; entrance_pupil_position: "telecentric", chief
+    rays are parallel in object space; exit_pupil_position: "telecentric", in image space. Lengths are compared with that of the lens, object to image
+    without the object distance.
+    """
+    data = first_order(lens)
+    length = max(sum(abs(float(surface.thickness.detach())) for surface in lens.surfaces[1:-1]), 1.0)
+    limits = {"effective_focal_length": _AFOCAL, "entrance_pupil_position": _FAR, "exit_pupil_position": _FAR}
+    far = {name for name, limit in limits.items() if abs(float(getattr(data, name).detach())) > limit * length}
+    far |= {"entrance_pupil_position"} if lens.fields.telecentric else set()
+    words = {name: "telecentric" for name in limits if name in far}
+    if "effective_focal_length" in words:
+        words["effective_focal_length"] = "afocal"
+        words |= {"back_focal_distance": "infinite", "front_focal_distance": "infinite"}
+    return words
+
+
+def telecentric_spaces(lens: Lens) -> list[str]:
+    """The spaces, "object" and "image", in which chief rays are parallel."""
+    spaces = {"entrance_pupil_position": "object", "exit_pupil_position": "image"}
+    return [spaces[name] for name in at_infinity(lens) if name in spaces]
+
+
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
     """Half angle of the cone at the object, radians, of an aperture given as object NA or cone angle."""
     kind, number = lens.aperture.kind, lens.aperture.value

@@ -33,7 +33,7 @@ from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, semi_diameters
 from raytrace.tracing.launch import unfilled
-from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.paraxial import at_infinity, first_order
 from raytrace.tracing.ray_failures import ray_failures
 from raytrace.viewer.state import State, has_merit, shown_fields, slider_ends, word_of
 
@@ -171,18 +171,26 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
 
 
 def first_order_of(lens: Lens) -> list[dict]:
-    """First-order data and the working F/#: name, value and unit."""
-    data = first_order(lens)
+    """First-order data and the working F/#: name, value and unit; words of a value that is infinite in practice."""
+    data, infinite = first_order(lens), at_infinity(lens)
+    names = {"EFL": "effective_focal_length", "entrance pupil": "entrance_pupil_position",
+        "exit pupil": "exit_pupil_position"}  # fmt: skip
     rows = (
         ("EFL", data.effective_focal_length, "mm"),
         ("BFD", data.back_focal_distance, "mm"),
         ("F/#", data.f_number, ""),
         ("working F/#", working_f_number(lens), ""),
         ("EPD", data.entrance_pupil_diameter, "mm"),
+        ("entrance pupil", data.entrance_pupil_position, "mm"),
+        ("exit pupil", data.exit_pupil_position, "mm"),
         ("m", data.magnification, ""),
         ("image at", data.paraxial_image_distance, "mm"),
     )
-    return [{"name": name, "value": plain(float(value)), "unit": unit} for name, value, unit in rows]
+    return [
+        {"name": name, "value": plain(float(value)), "unit": unit}
+        | ({"words": word} if (word := infinite.get(names.get(name, ""))) else {})
+        for name, value, unit in rows
+    ]
 
 
 def refresh(state: State) -> dict:

@@ -490,7 +490,7 @@ class Viewer {
     this.paraxial.replaceChildren(...(now.first_order || []).map((one, k) => {
       if (one.name === "m" && one.value === 0) return ""; // the object is at infinity
       const was = stored && stored.first_order ? stored.first_order[k].value : undefined;
-      const value = make("dd", { textContent: `${words(one.value, 5)} ${one.unit}`, "data-number": one.name, "data-value": one.value ?? "" });
+      const value = make("dd", { textContent: one.words || `${words(one.value, 5)} ${one.unit}`, "data-number": one.name, "data-value": one.value ?? "" });
       if (was !== undefined && was !== one.value) value.append(make("span", { className: "was", textContent: ` (${words(was, 4)})` }));
       return make("div", {}, make("dt", { textContent: one.name }), value);
     }));
