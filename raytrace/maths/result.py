@@ -165,13 +165,13 @@ class Result:
             tables = self.tables()
         except TypeError:
             return _block(str(self).splitlines())
-        parts = ((_block(t.title), html_table(self.printed(t.columns)), _block(t.notes)) for t in tables)
+        parts = ((_block(t.title), html_table(self.printed_columns(t.columns)), _block(t.notes)) for t in tables)
         return "\n".join(part for table in parts for part in table if part)
 
     def _lines(self, columns: Columns) -> list[str]:
-        return text_table(self.printed(columns))
+        return text_table(self.printed_columns(columns))
 
-    def printed(self, columns: Columns) -> dict[Column, Sequence]:
+    def printed_columns(self, columns: Columns) -> dict[Column, Sequence]:
         """Columns as they are printed, without field_x where it is 0."""
         listed: dict[Any, Any] = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}
         words, printed = self.words(), {}

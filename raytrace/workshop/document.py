@@ -70,7 +70,7 @@ def settled(figure: Figure) -> Figure:
 
 def grid_of(columns: Columns, result: Result | None = None) -> Grid:
     """A table of the columns of a result, with its units and formats."""
-    printed: dict[Column, Sequence] = dict(columns) if result is None else result.printed(columns)
+    printed: dict[Column, Sequence] = dict(columns) if result is None else result.printed_columns(columns)
     heads, rows = [], []
     for column, values in printed.items():
         first, second, *texts = cells(column, values)
