@@ -42,12 +42,13 @@ DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
     "--step": "codesign chooses the unit of its variables, sag takes a length",
-    "--start": "compare chooses from two places, codesign takes a distance, too",
+    "--start": "compare-models chooses from two places, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
     "--configuration": "layout draws all of them in one figure",
     "--log": "optimize writes one; elsewhere the scale of a figure",
     "--resume": "codesign finds its own runs",
     "--depth": "layers of a network, distances of points, and a map",
+    "--tolerance": "a height error of etching, and a switch for the lens as built",
     "--sensor": "its distance from an element, and its size",
     "--efl": "edit scales to a number, stock finds parts within a range",
     "--elements": "draw has sheets of some, stock finds parts of a number of them",
@@ -94,6 +95,7 @@ def test_data_pixels_and_figures_have_their_own_options(name):
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
         others = {"render": ("x.pdf", "ends in .png"), "draw": ("x.zmx", "is no drawing")}
+        others["report"] = ("x.png", "is no report")
         wrong, said = others.get(name, ("x.png", "is a picture: figures are saved by"))
         with pytest.raises(argparse.ArgumentTypeError, match=said):
             known["-o"].type(wrong)
@@ -288,10 +290,10 @@ FLAT += "0,inf,inf,,,\n1,inf,5,N-BK7,10,1\n2,inf,50,,10,\n3,inf,0,,,\n"
         ("field-curvature tessar --field 0 --plot curvature.png", "all fields are on the axis; give others by --field"),
         ("field-curvature flat.csv", "no number of field curvature exists for this lens"),
         (
-            "compare hubble",
+            "compare-models hubble",
             "within the focal length, or the lens diverges (paraxial image at -1068.25 mm); its focal len",
         ),
-        ("compare hubble --focus-distance inf", "give --focus-distance and --object-distance beyond, or inf"),
+        ("compare-models hubble --focus-distance inf", "give --focus-distance and --object-distance beyond, or inf"),
     ],
 )
 def test_an_analysis_without_results_is_reported(command, words, message):
@@ -355,6 +357,8 @@ NO_OPTION = {
 OF_PYTHON = {
     "optimize": {"loss", "of", "object_distances", "first", "restarts", "check_rings"},
     "search": {"loss", "of", "object_distances"},
+    "compare": {"names"},
+    "report": {"path"},
 }
 #: Functions whose parameters are options of a command, by a parameter of its public function that holds them.
 PARTS = {

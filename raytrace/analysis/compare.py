@@ -109,12 +109,12 @@ class LensComparison(Result):
     def COLUMNS(self) -> Sequence[Column]:  # type: ignore[override]
         columns = []
         for name in self._values():
-            of = self.first.column(name)
-            title, _, second = (of.heading or name.replace("_", " ")).partition("\n")
+            column = self.first.column(name)
+            title, _, second = (column.heading or name.replace("_", " ")).partition("\n")
             title = "" if name == "value" else f"{title} {second}".strip()
-            form = of.form.removeprefix("+")
+            form = column.form.removeprefix("+")
             ends = (("_1", "A"), ("_2", "B"), ("_change", "B − A"))
-            columns += [Column(name + end, of.unit, form, f"{title if k == 0 else ' '}\n{label}")
+            columns += [Column(name + end, column.unit, form, f"{title if k == 0 else ' '}\n{label}")
                         for k, (end, label) in enumerate(ends)]  # fmt: skip
         return [*columns, Column("quantity", form="<"), Column("unit", form="<", heading="unit or definition")]
 
@@ -131,13 +131,13 @@ class LensComparison(Result):
         first, second = self._tables_of_both()
         table = {name: column for name, column in first.items() if name in _HEADS}
         for name in self._values():
-            one, other = first[name], second[name]
-            table |= {f"{name}_1": one, f"{name}_2": other, f"{name}_change": other - one}
+            single, other = first[name], second[name]
+            table |= {f"{name}_1": single, f"{name}_2": other, f"{name}_change": other - single}
         return table | ({"unit": table["quantity"]} if "quantity" in table else {})
 
     def column(self, name: str) -> Column:
-        own = next((column for column in self.COLUMNS if column.name == name), None)
-        return own or self.first.column(name)
+        known = next((column for column in self.COLUMNS if column.name == name), None)
+        return known or self.first.column(name)
 
     def words(self) -> dict[str, Sequence[str]]:
         if self.analysis != "layout":
@@ -210,9 +210,11 @@ def compare(
         listed = ", ".join(known)
         raise Incomparable(f"{option('analysis', analysis)}: no such analysis{meant}; expected one of {listed}")
     both = (lens, as_lens(other, "compare"))
-    lens, other = (detached(one if wavelengths is None else with_wavelengths(one, wavelengths)) for one in both)
+    lens, other = (
+        detached(single if wavelengths is None else with_wavelengths(single, wavelengths)) for single in both
+    )
     if lens.fields.kind != other.fields.kind:
-        kinds = " and ".join(one.fields.kind.replace("_", " ") for one in (lens, other))
+        kinds = " and ".join(single.fields.kind.replace("_", " ") for single in (lens, other))
         raise Incomparable(f"the fields of the lenses are of different kinds, {kinds}: they have no common field")
     if frequencies is not None and key != "mtf":
         raise Incomparable(f"{option('frequencies')} goes with {option('analysis', 'mtf')}")
@@ -224,7 +226,7 @@ def compare(
     given |= {} if frequencies is None else {"frequencies": frequencies}
     if key == "mtf" and frequencies is None:
         points = field_points(fields, like=lens)
-        ranges = [frequency_range(one, points, _FREQUENCIES) for one in (lens, alike)]
+        ranges = [frequency_range(single, points, _FREQUENCIES) for single in (lens, alike)]
         given["frequencies"] = max(ranges, key=lambda row: float(row[-1]))
     first = entry.make(lens, **given)
     second = entry.make(alike, **entry.alike(first))
@@ -247,8 +249,8 @@ def _to_common_radius(first: Any, other: Lens) -> tuple[Result, Result]:
     alone = encircled_energy(other, fields=first.fields)
     radii = max(first.radii, alone.radii, key=lambda row: float(row[-1]))
     results = (encircled_energy(lens, radii, fields=first.fields) for lens in (first.lens, other))
-    one, two = (dataclasses.replace(result, marked=False) for result in results)
-    return one, two
+    single, two = (dataclasses.replace(result, marked=False) for result in results)
+    return single, two
 
 
 def _first_order(lens: Lens) -> dict[str, Tensor]:
@@ -261,9 +263,9 @@ def _first_order(lens: Lens) -> dict[str, Tensor]:
 # -- figures
 
 
-def _curves(of: LensComparison, plot: Curves) -> Figure:
+def _curves(pair: LensComparison, plot: Curves) -> Figure:
     """The curves of both lenses: a panel for each of `plot.panels`, one colour a lens, dashes for the rest."""
-    results = [getattr(result, "drawn", lambda result=result: result)() for result in (of.first, of.second)]
+    results = [getattr(result, "drawn", lambda result=result: result)() for result in (pair.first, pair.second)]
     tables = [flat({**result.columns(), **_summary(result)}) for result in results]
     keys = {"field": ("field_x", "field_y"), "wavelength": ("wavelength",)}
     dims = [dim for dim, names in keys.items() if names[0] in tables[0] and not (dim == "field" and plot.x == "field")]
@@ -299,7 +301,7 @@ def _curves(of: LensComparison, plot: Curves) -> Figure:
         title = [_word(dim, part, labels, plot) for dim, part in zip(shown, place, strict=True)]
         if plot.is_shared:
             panel.set_title(", ".join(title))
-        x_name = plot.x_name or field_name(of.first.lens)
+        x_name = plot.x_name or field_name(pair.first.lens)
         axis_names = (plot.name if plot.is_shared else ", ".join(title), x_name)
         x_label, y_label = axis_names if plot.upright else axis_names[::-1]
         if plot.is_shared:
@@ -321,7 +323,7 @@ def _curves(of: LensComparison, plot: Curves) -> Figure:
             panel.locator_params(axis="x", nbins=5)
     words = [", ".join(_word(dim, part, labels, plot) for dim, part in zip(dashed, style, strict=True)
                        if len(groups[dim]) > 1) for style in styles]  # fmt: skip
-    return _finished(figure, of, [*zip(words, DASHES * len(words), strict=False)] if len(styles) > 1 else [])
+    return _finished(figure, pair, [*zip(words, DASHES * len(words), strict=False)] if len(styles) > 1 else [])
 
 
 def _summary(result: Any) -> dict[str, Tensor]:
@@ -369,13 +371,13 @@ def _word(dim: str, part: tuple, labels: Mapping[str, Mapping], plot: Curves) ->
 
 
 def _finished(
-    figure: Figure, of: LensComparison, dashes: Sequence[tuple[str, Dash]] = (), *, coloured: bool = True
+    figure: Figure, pair: LensComparison, dashes: Sequence[tuple[str, Dash]] = (), *, coloured: bool = True
 ) -> Figure:
     """The figure with its title, and a legend of lenses and dashes."""
     handles = (
         [
             legend_entry(f"{letter}: {name}", color=colour, linewidth=2)
-            for letter, name, colour in zip("AB", of.names, COLOURS, strict=True)
+            for letter, name, colour in zip("AB", pair.names, COLOURS, strict=True)
         ]
         if coloured
         else []
@@ -387,28 +389,28 @@ def _finished(
         figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     titles = {"rms_over_field": "RMS over the field", "mtf": "MTF", "opd_fan": "OPD fans", "ray_fan": "ray fans"}
     titles["seidel"] = "sums of the Seidel aberrations"
-    figure.suptitle(titles.get(of.analysis, of.analysis.replace("_", " ")), fontweight="bold", fontsize=10)
+    figure.suptitle(titles.get(pair.analysis, pair.analysis.replace("_", " ")), fontweight="bold", fontsize=10)
     return figure
 
 
-def _draw_layouts(of: LensComparison) -> Figure:
+def _draw_layouts(pair: LensComparison) -> Figure:
     """The cross sections one above the other, on one scale of mm."""
     figure = new_figure(8.0, 7.2)
     panels = [*figure.subplots(2, 1)]
-    for panel, letter, name, drawn in zip(panels, "AB", of.names, (of.first, of.second), strict=True):
+    for panel, letter, name, drawn in zip(panels, "AB", pair.names, (pair.first, pair.second), strict=True):
         draw_layout(panel, drawn.lens, fields=drawn.fields)
         panel.set_title(f"{letter}: {name}", fontsize=9)
     on_one_scale(panels)
     (left, right), (low, high) = panels[0].get_xlim(), panels[0].get_ylim()
     figure.set_size_inches(8.0, min(max(2 * 7.6 * abs((high - low) / (right - left)), 3.0), 10.0) + 1.0)
-    return _finished(figure, of, coloured=False)
+    return _finished(figure, pair, coloured=False)
 
 
-def _draw_spots(of: LensComparison) -> Figure:
+def _draw_spots(pair: LensComparison) -> Figure:
     """A row of spots for each lens, on one scale."""
-    both = [result.dots() for result in (of.first, of.second) if isinstance(result, Spots)]
+    both = [result.dots() for result in (pair.first, pair.second) if isinstance(result, Spots)]
     half = max(panel_size(whole.geometric_radius.tolist(), float(airy_radius(lens))) for lens, whole, *_ in both)
-    fields, labels = of.first.fields, [field_text for field_text in _labels(of.first)]
+    fields, labels = pair.first.fields, [field_text for field_text in _labels(pair.first)]
     count = fields.shape[1]
     rows = -(-count // 4)
     across = min(count, 4)
@@ -429,7 +431,7 @@ def _draw_spots(of: LensComparison) -> Figure:
     lens = both[0][0]
     legend = figure.legend(
         handles=wavelength_handles(lens.wavelengths.tolist(), float(airy_radius(lens))),
-        title=fill(f"A: {of.names[0]}\nB: {of.names[1]}", width, 8), loc="outside lower center",
+        title=fill(f"A: {pair.names[0]}\nB: {pair.names[1]}", width, 8), loc="outside lower center",
         ncols=min(6, int(width / 1.05)), handletextpad=0.3,
     )  # fmt: skip
     legend.get_title().set_fontsize(8)
@@ -441,11 +443,11 @@ def _labels(result: Any) -> Sequence[str]:
     return field_labels(result)
 
 
-def _draw_maps(of: LensComparison) -> Figure:
+def _draw_maps(pair: LensComparison) -> Figure:
     """A row of wavefront maps at the primary wavelength for each lens, on one scale of colours."""
-    both = [result for result in (of.first, of.second) if isinstance(result, WavefrontMap)]
+    both = [result for result in (pair.first, pair.second) if isinstance(result, WavefrontMap)]
     w = both[0].lens.primary_wavelength - 1
-    maps = [np.where(array(one.valid)[:, w], array(one.opd)[:, w], np.nan) for one in both]
+    maps = [np.where(array(single.valid)[:, w], array(single.opd)[:, w], np.nan) for single in both]
     colours, scale = diverging(np.stack(maps))
     labels = field_labels(both[0])
     across = min(len(labels), 4)
@@ -469,15 +471,15 @@ def _draw_maps(of: LensComparison) -> Figure:
     bar.set_label("OPD (waves)")
     bar.outline.set_visible(False)
     wavelength = number_text(1e3 * float(primary_wavelength(both[0].lens)), 4)
-    words = f"wavefront, {wavelength} nm\nA: {of.names[0]}\nB: {of.names[1]}"
+    words = f"wavefront, {wavelength} nm\nA: {pair.names[0]}\nB: {pair.names[1]}"
     figure.suptitle(fill(words, figure.get_figwidth(), 9, bold=True), fontweight="bold", fontsize=9)
     return figure
 
 
-def _draw_sums(of: LensComparison) -> Figure:
+def _draw_sums(pair: LensComparison) -> Figure:
     """Bars of the sums of the Seidel aberrations of the outermost field."""
-    sums = [flat(result.summary()) for result in (of.first, of.second)]  # type: ignore[attr-defined]
-    names = [name for name in of.first.names if len(of.first.lens.wavelengths) > 1 or name[0] != "C"]  # type: ignore[attr-defined]
+    sums = [flat(result.summary()) for result in (pair.first, pair.second)]  # type: ignore[attr-defined]
+    names = [name for name in pair.first.names if len(pair.first.lens.wavelengths) > 1 or name[0] != "C"]  # type: ignore[attr-defined]
     figure = new_figure(6.0, 3.8)
     panel: Axes = ruled(figure.add_subplot())
     for k, (table, colour) in enumerate(zip(sums, COLOURS, strict=True)):
@@ -485,8 +487,8 @@ def _draw_sums(of: LensComparison) -> Figure:
         panel.bar(place, [table[name][-1] for name in names], width=0.38, color=colour)
     panel.set_xticks(range(len(names)), names)
     panel.axhline(0, color=GREY, linewidth=0.6)
-    panel.set_ylabel(f"sum over the surfaces ({of.first.unit})")  # type: ignore[attr-defined]
-    return _finished(figure, of)
+    panel.set_ylabel(f"sum over the surfaces ({pair.first.unit})")  # type: ignore[attr-defined]
+    return _finished(figure, pair)
 
 
 def _at_fields(first: Any) -> dict[str, Any]:

@@ -268,7 +268,7 @@ class Info(Result):
         if not rows:
             return ["", "  the axial chief ray does not reach the image"]
         lines = ["", f"  {'about the axial chief ray':<24} {'tangential':>16} {'sagittal':>16}"]
-        lines += [f"  {words:<24} {one:>16} {other:>16}  {unit}".rstrip() for words, one, other, unit in rows]
+        lines += [f"  {words:<24} {first:>16} {second:>16}  {unit}".rstrip() for words, first, second, unit in rows]
         return [*lines, ""]
 
     def _conditions_in_words(self) -> list[str]:

@@ -246,11 +246,11 @@ def _grid(grid: Grid) -> Iterator[_Table]:
         head.rules += [(1.5, 0.8, x, x + total), (head.height - 1.5, 0.5, x, x + total)]
         foot.rules.append((1.5, 0.8, x, x + total))
         for (first, second), side, width in zip(grid.heads, grid.sides, widths, strict=True):
-            at = left + _PAD if side == "left" else left + width - _PAD
-            head.texts.append((at, 3 + 0.7 * pitch, first, {"fontsize": size, "weight": "bold", "ha": side}))
+            place = left + _PAD if side == "left" else left + width - _PAD
+            head.texts.append((place, 3 + 0.7 * pitch, first, {"fontsize": size, "weight": "bold", "ha": side}))
             if second:
                 look = {"fontsize": size, "color": style.GREY, "ha": side}
-                head.texts.append((at, 3 + 1.7 * pitch, second, look))
+                head.texts.append((place, 3 + 1.7 * pitch, second, look))
             left += width
     rows = []
     for k in range(length):
@@ -269,8 +269,8 @@ def _row(
     for text, side, width in zip(row, grid.sides, widths, strict=True):
         lines = _lines(text, width - 2 * _PAD, size)
         for n, line in enumerate(lines):
-            at = x + _PAD if side == "left" else x + width - _PAD
-            piece.texts.append((at, (0.7 + n) * pitch, line, {"fontsize": size, "ha": side}))
+            place = x + _PAD if side == "left" else x + width - _PAD
+            piece.texts.append((place, (0.7 + n) * pitch, line, {"fontsize": size, "ha": side}))
         most = max(most, len(lines))
         x += width
     piece.height = max(piece.height, most * pitch)

@@ -159,16 +159,17 @@ def _first_order(request: _Request, writer: _Writer) -> None:
         writer.blocks.append(rows_grid(("quantity", "value", "unit or definition"), infos[0].quantities(), "lrl"))
     else:
         heads = ["quantity", *(f"configuration {lens.current_configuration}" for lens in request.lenses), "unit"]
-        columns = [one.quantities() for one in infos]
-        rows = [(one[0][0], *(figure for _, figure, _ in one), one[0][2]) for one in zip(*columns, strict=True)]
+        columns = [entry.quantities() for entry in infos]
+        rows = [(row[0][0], *(figure for _, figure, _ in row), row[0][2]) for row in zip(*columns, strict=True)]
         writer.blocks.append(rows_grid(heads, rows, "l" + "r" * len(infos) + "l"))
-    for lens, one in zip(request.lenses, infos, strict=True):
-        if rows := one.base_ray_quantities():
+    for lens, entry in zip(request.lenses, infos, strict=True):
+        if rows := entry.base_ray_quantities():
             writer.blocks.append(Heading("About the axial chief ray" + _of(request, lens)))
             writer.blocks.append(rows_grid(("quantity", "tangential", "sagittal", "unit"), rows, "lrrl"))
     writer.blocks.append(Heading("Wavelengths and fields"))
-    listed = zip(*(one.scene() for one in infos), strict=True) if len({len(one.scene()) for one in infos}) == 1 else ()
-    for pairs in listed or zip(infos[0].scene(), strict=True):
+    scenes = [entry.scene() for entry in infos]
+    listed = zip(*scenes, strict=True) if len(set(map(len, scenes))) == 1 else ()
+    for pairs in listed or zip(scenes[0], strict=True):
         texts = [*dict.fromkeys(text for _, text in pairs)]
         if pairs[0][0] == "configuration":
             continue
@@ -179,7 +180,7 @@ def _first_order(request: _Request, writer: _Writer) -> None:
                 f"{pairs[0][0].capitalize()}{_of(request, lens)}: {text}"
                 for lens, (_, text) in zip(request.lenses, pairs, strict=True)
             ]
-    writer.documents += [one.document() for one in infos]
+    writer.documents += [entry.document() for entry in infos]
 
 
 def _prescription(request: _Request, writer: _Writer) -> None:
@@ -365,7 +366,7 @@ def report(
     also: Sequence[str] = (),
     fields: Points = None,
     wavelengths: Numbers = None,
-    configuration: int | Literal["all"] = "all",
+    configuration: int | str = "all",
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
     tolerance: bool = False,
@@ -394,14 +395,16 @@ def report(
     if path is not None and Path(path).suffix.lower() not in REPORTS:
         raise ValueError(f"{path}: expected a name that ends in {', '.join(REPORTS)}")
     lens = detached(lens if wavelengths is None else with_wavelengths(lens, wavelengths))
-    if configuration != "all":
+    if isinstance(configuration, int):
         lens = lens.configuration(configuration)
+    elif configuration != ALL:
+        raise BadReport(f"{option('configuration', configuration)}: expected a number from 1, or {ALL}")
     expands = lens.environment is not None or any(
         s.expansion is not None or s.environment is not None for s in lens.surfaces
     )
     extra = {"as-built": tolerance, "temperature": temperatures is not None or expands}
     names = _chosen(only, without, [*also, *(name for name, wanted in extra.items() if wanted)])
-    lenses = tuple(detached(one) for one in lens.configurations) if configuration == "all" else (lens,)
+    lenses = tuple(map(detached, lens.configurations)) if configuration == ALL else (lens,)
     date = datetime.date.today().isoformat() if date is None else date
     options = {
         "grade": grade, "limits": limits, "criterion": criterion, "trials": trials, "seed": seed, "date": date,
