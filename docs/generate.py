@@ -19,7 +19,6 @@ from raytrace.io.zemax import configurations, optimization, surfaces
 from raytrace.optimization.operands.table import OPERANDS
 
 FOLDER = Path(__file__).parent / "reference" / "generated"
-WAVE = ("psf", "design", "restore")
 
 
 def help_of(*words: str) -> str:
@@ -32,9 +31,11 @@ def help_of(*words: str) -> str:
 
 def commands() -> str:
     """A section for each command, with its help."""
-    names = [(command.name,) for command in COMMANDS]
-    at = names.index(("wave",))
-    names[at : at + 1] = [("wave", part) for part in WAVE]
+    names = [
+        (command.name, *part)
+        for command in COMMANDS
+        for part in [(child.name.removeprefix(f"{command.name}-"),) for child in command.subcommands] or [()]
+    ]
     parts = [f"## `raytrace {' '.join(words)}`\n\n```text\n{help_of(*words)}\n```\n" for words in names]
     return "# Commands\n\nThe text of `raytrace COMMAND --help`.\n\n" + "\n".join(parts)
 

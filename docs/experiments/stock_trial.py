@@ -209,7 +209,7 @@ def designs() -> dict[str, tuple[rt.Lens, dict]]:
         }),
         "expander": (expander, free | {
             "vary": "curvature thickness:2", "merit": "angular", "hold": "angular_magnification=0.2",
-            "bounds": "thickness_2:60..110",
+            "bounds": "thickness_2:60..130",
         }),
     }  # fmt: skip
 

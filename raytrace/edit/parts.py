@@ -67,7 +67,11 @@ def insert_part(lens: Lens, before: At, part: Part, *, reverse: bool = False, ga
         raise BadEdit(f"{option('insert_part')}: {medium.glass.name} is before surface {k}; parts are in air")
     faces = [*faces_of(part, reverse=reverse)]
     like = lens.surfaces[1].thickness
-    last = {"thickness": as_tensor(gap, dtype=like.dtype), "glass": medium.glass, "environment": medium.environment}
+    last: dict[str, Any] = {
+        "thickness": as_tensor(gap, dtype=like.dtype),
+        "glass": medium.glass,
+        "environment": medium.environment,
+    }
     faces[-1] = dataclasses.replace(faces[-1], **last)
     faces[0] = dataclasses.replace(faces[0], comment=name_of(part))
     return _with_sizes(inserted(lens, k, faces), range(k, k + len(faces)))
@@ -142,8 +146,8 @@ def with_part(
     lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
     if (data := lens.optimization_data) is not None:
         variables, solves = left_of(data.variables, data.solves, first, last, lost)
-        _, kept = left_of((), data.kept, first, last, lost)
-        data = dataclasses.replace(data, variables=variables, solves=solves, kept=kept)
+        _, stored = left_of((), data.kept, first, last, lost)
+        data = dataclasses.replace(data, variables=variables, solves=solves, kept=stored)
         lens = dataclasses.replace(lens, optimization_data=data)
     return _with_sizes(lens, range(first, last + 1)), lost
 

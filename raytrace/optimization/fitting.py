@@ -26,18 +26,19 @@ import numpy as np
 
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Columns, Table
-from raytrace.optimization.glass_choice import expansion
+from raytrace.optimization.glass_choice import Expansion, expansion
 from raytrace.optimization.least_squares import SumOfSquares, least_squares
 from raytrace.optimization.problem import Problem, typical_of
 from raytrace.words import RaytraceWarning, calling_level
 
 #: Candidates of an item that are optimised, and over how many cycles; designs that are continued.
-TRIED, TRIAL_CYCLES, BEAM = 4, 15, 3
+TRIED, TRIAL_CYCLES, BEAM = 4, 25, 3
 _CYCLES = 100  # with every item
 _ROUNDS = 3  # of exchanges through all items
 _GAIN = 1e-4  # smallest relative reduction of the merit by an exchange
-_MET = 1e-5  # violation up to which a condition counts as met
-_NEARLY = 1e-3  # violation of a condition that doubles the merit of a trial, whose cycles are few
+_MET = 1e-4  # violation up to which a condition counts as met, until the last descent
+_LAST = 500  # cycles of that
+_NEARLY = 1e-2  # violation of a condition that doubles the merit of a trial, whose cycles are few
 
 #: The two orders of the items.
 ORDERS = {"worst": "the item that raises the merit most first", "best": "the item that raises the merit least first"}
@@ -78,12 +79,8 @@ class Design:
         """The largest violation of a condition."""
         return float(self.state.missed.max(initial=0.0))
 
-    def rank(self) -> tuple[float, float, float]:
-        """Fewer failed rays, then conditions met, then a lower merit."""
-        return self.state.lost, self.missed if self.missed > _MET else 0.0, self.merit
-
     def score(self) -> tuple[float, float]:
-        """The rank of a trial: fewer failed rays, then a lower merit with a charge for conditions that are not met."""
+        """The order of trials: fewer failed rays, then a lower merit with a charge for conditions that are not met."""
         return self.state.lost, self.merit * (1 + self.missed / _NEARLY)
 
 
@@ -229,10 +226,11 @@ class Fit(ABC):
                 if best.chosen and time.monotonic() > self.until:
                     break
                 design, steps = self.sequence(items, order)
-                if not best.chosen or design.rank() < best.rank():
+                if not best.chosen or self.rank(design) < self.rank(best):
                     best, kept, self.order = design, [*self.steps[:1], *steps], order
             self.steps = kept
             best = self.exchanged(best)
+            best = self.descend(best, _LAST if self.cycles == _CYCLES else self.cycles)
         except KeyboardInterrupt:
             self.interrupted, self.steps = True, kept if best.chosen else [*self.steps[:1], *self.so_far[1]]
             best = best if best.chosen else self.so_far[0]
@@ -285,7 +283,7 @@ class Fit(ABC):
                 (end, [*steps[:-1], dataclasses.replace(steps[-1], reached=end.merit, seconds=self.seconds)])
                 for end, steps in beam
             ]
-            beam.sort(key=lambda pair: pair[0].rank())
+            beam.sort(key=lambda pair: self.rank(pair[0]))
             self.so_far = beam[0]
         return beam[0]
 
@@ -296,20 +294,26 @@ class Fit(ABC):
             if not left or time.monotonic() > self.until:
                 break
             item = left.pop(0)
-            ends = []
+            ends: list[tuple[Design, float, Any]] = []
             for predicted, candidate in self.candidates(design, item)[: TRIED + 1]:
                 if candidate != design.chosen[item]:
                     ends.append((self.trial(design, item, candidate), predicted, candidate))
             if not ends:
                 continue
             trial, predicted, candidate = min(ends, key=lambda end: end[0].score())
-            lost, missed, merit = design.rank()
-            end = self.descend(trial, self.cycles) if trial.score() < (lost, 1.5 * design.score()[1]) else trial
-            if end.rank() < (lost, missed, merit * (1 - _GAIN)):
+            *first, merit = self.rank(design)
+            is_near = trial.score() < (design.state.lost, 1.5 * design.score()[1])
+            end = self.descend(trial, self.cycles) if is_near else trial
+            if self.rank(end) < (*first, merit * (1 - _GAIN)):
                 design, left = end, [other for other in design.chosen if other != item]
                 words = item.words, self.name(item, candidate)
                 self.steps.append(FitStep("exchanged", end.merit, self.seconds, *words, predicted))
         return design
+
+    def rank(self, design: Design) -> tuple[float, int, float, float]:
+        """Fewer failed rays, then fewer parts that are smaller than the light, conditions met, and a lower merit."""
+        missed = design.missed if design.missed > _MET else 0.0
+        return design.state.lost, len(self.exceeded(design)), missed, design.merit
 
     def trial(self, design: Design, item: Item, candidate: Any) -> Design:
         """The design with a candidate, optimised over some cycles."""
@@ -343,7 +347,7 @@ def free_of(design: Design) -> np.ndarray:
     return np.flatnonzero((x > design.lower) & (x < design.upper))
 
 
-def relaxed(state: SumOfSquares, following: np.ndarray, columns: Sequence[int] = ()) -> Any:
+def relaxed(state: SumOfSquares, following: np.ndarray, columns: Sequence[int] | np.ndarray = ()) -> Expansion:
     """The expansion of the merit by columns of the variables, with the `following` ones at their best."""
     met = state.limits_slope[np.abs(state.limits) < _MET] if len(state.limits) else np.zeros((0, len(state.x)))
     met = met[np.abs(met[:, following]).sum(1) > 0] if len(met) else met

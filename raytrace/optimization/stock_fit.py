@@ -20,7 +20,7 @@ from raytrace.stock.index import StockPart, lenses_of, parts_of
 from raytrace.stock.parts import data_of, is_round
 from raytrace.system.elements import cemented_groups, lens_elements
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Vary
+from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import GLASS
 from raytrace.system.surface import Surface
 from raytrace.tracing.geometry import light_diameter
@@ -73,7 +73,8 @@ class StockFit(Fit):
     def items(self) -> list[Item]:
         model, x = self.design.problem.model, self.design.state.x
         lens, groups = model.lens_at(x), []
-        moved = {rule.address for rule in (*model.variables, *model.solves)}
+        rules: tuple[Vary | Solve, ...] = (*model.variables, *model.solves)
+        moved = {rule.address for rule in rules}
         cemented = cemented_groups(lens)
         singles = [pair for pair in lens_elements(lens) if not any(a <= pair[0] < b for a, b in cemented)]
         for first, last in sorted([*cemented, *singles]):

@@ -204,7 +204,7 @@ def _of_table(path: Path) -> list[tuple[str, Callable[[], _Read]]]:
             )
     if missing := {"part", "radius_1", "thickness_1", "glass_1", "radius_2"} - {*names}:
         raise BadStock(f"{path}:1: no column {min(missing)}; expected part, radius_1, thickness_1, glass_1, radius_2")
-    rows = []
+    rows: list[tuple[str, Callable[[], _Read]]] = []
     for cells in reader:
         row = {name: (cell or "").strip() for name, cell in zip(names, cells.values(), strict=False)}
         line = reader.line_num
@@ -323,7 +323,9 @@ def parts_of(index: str | os.PathLike) -> list[StockPart]:
     with _opened(index) as database:
         rows = database.execute(f"SELECT {names}, file FROM parts ORDER BY part").fetchall()
     nan = [k for k, field in enumerate(dataclasses.fields(Figures)) if field.name == "abbe"]
-    cells = [[math.nan if k in nan and cell is None else cell for k, cell in enumerate(row)] for row in rows]
+    cells: list[list[Any]] = [
+        [math.nan if k in nan and cell is None else cell for k, cell in enumerate(row)] for row in rows
+    ]
     return [StockPart(Figures(*row[:-1]), row[-1], os.fspath(index)) for row in cells]
 
 
