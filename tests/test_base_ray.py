@@ -12,6 +12,7 @@ from differences import gradcheck
 
 import raytrace as rt
 from raytrace.cli import main
+from raytrace.tracing import base_ray as base
 from raytrace.tracing.paraxial import largest_field
 from raytrace.tracing.trace import Bent, at_stop, is_bent
 
@@ -241,3 +242,17 @@ def test_the_largest_field_of_a_bent_lens_is_one_of_its_own():
     lens = rt.read_lens("double_gauss").at(fields=[(0.0, 5.0), (-8.0, 0.0)])
     assert largest_field(lens)[:, 0].tolist() == [0.0, 8.0]
     assert largest_field(bends.folded(lens, 10, tilt_x=45.0))[:, 0].tolist() == [-8.0, 0.0]
+
+
+def test_the_entrance_is_traced_to_the_stop_alone():
+    """Its matrices are those of the trace to the image, with their derivatives, of perturbed lenses of a batch."""
+    lens = rt.read_lens("double_gauss").at(ray_aiming="real")
+    tolerances, curvature = rt.tolerances(lens, grade="commercial"), real(0.0).requires_grad_()
+    lens = lens.replace(2, curvature=lens.surfaces[2].curvature + curvature)
+    built = rt.tolerancing.perturbed(lens, tolerances, rt.tolerancing.draw_errors(tolerances, 3, seed=4))
+    front, whole = base._front(built, built.primary), base._near(built, built.primary).front
+    for name, part, other in zip(front._fields, front, whole, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-11, atol=1e-13, msg=name)
+        if part.requires_grad:
+            slope, wanted = (torch.autograd.grad(t.sum(), curvature, retain_graph=True)[0] for t in (part, other))
+            torch.testing.assert_close(slope, wanted, rtol=1e-9, atol=1e-9, msg=name)

@@ -20,8 +20,9 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
+from raytrace.tracing import compiled
 from raytrace.tracing.compiled import push, rows_of, task_of, trace_compiled, trace_engine
-from raytrace.tracing.trace import trace_surfaces
+from raytrace.tracing.trace import points_at, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -409,3 +410,31 @@ def test_a_plane_edge_on_loses_the_rays_along_it_alone():
         (gradient,) = torch.autograd.grad(end.position.sum(), tilt, retain_graph=True)
         assert torch.isfinite(gradient)
         assert_close(end.position[1, 3:], heights[3:] + 0.4, rtol=0, atol=1e-14)
+
+
+def test_numbers_of_a_search_are_prepared_once(monkeypatch):
+    """Of tilted surfaces and rays that differ from call to call: the rays are those of a trace by itself, with and
+    without derivatives, whose numbers are two kinds."""
+    lens = rt.read_lens("double_gauss")
+    tolerances = rt.tolerances(lens, grade="commercial")
+    curvature = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    lens = lens.replace(3, curvature=lens.surfaces[3].curvature + curvature)
+    lens = rt.tolerancing.perturbed(lens, tolerances, rt.tolerancing.draw_errors(tolerances, 2, seed=1))
+    made, structure_of = [], compiled.structure_of
+    search = points_at(lens, lens.primary, (lens.stop, len(lens.surfaces) - 1))
+    bundles = [
+        start(vector(0.1 * n, -0.5, 2.0, 1.0, 0.5, 0.0).reshape(3, 2), vector(0.0, 0.1, 1.0)[:, None]) for n in (1, 2)
+    ]
+    monkeypatch.setattr(compiled, "structure_of", lambda *a: (made.append(a), structure_of(*a))[1])
+    for rays in (*bundles, *bundles):
+        with torch.no_grad():
+            search(rays)
+        points, _ = search(rays)
+        count = len(made)
+        alone, _ = points_at(lens, lens.primary, (lens.stop, len(lens.surfaces) - 1))(rays)
+        del made[count:]
+        for point, other in zip(points, alone, strict=True):
+            assert torch.equal(point, other)
+            slope, wanted = (torch.autograd.grad(t.sum(), curvature, retain_graph=True)[0] for t in (point, other))
+            torch.testing.assert_close(slope, wanted, rtol=1e-12, atol=0)
+    assert len(made) == 4  # two runs of surfaces, without derivatives and with them

@@ -17,7 +17,7 @@ from raytrace.psf_models.dft import phasor
 from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import compute, pupil
 from raytrace.wave_optics.compute import psf
-from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, path
 from raytrace.wave_optics.plan import plan
 
 
@@ -230,3 +230,35 @@ def test_kernels_one_by_one_are_those_at_once_and_share_the_light_behind_the_pix
     assert (alone.axial is None) == (size == 7)
     assert alone.axial is None or torch.allclose(alone.axial, at_once.axial, rtol=1e-14, atol=0)
     assert alone.kernel.shape == (3, 2, size, size)
+
+
+@pytest.mark.parametrize(("shape", "parts", "middle"), [((9, 9), 3, (0.0, 0.0)), ((8, 10), 4, (0.02, -0.01))])
+def test_pixels_that_the_edge_leaves_whole_are_summed_as_their_cells(shape, parts, middle):
+    """Against the sum over every cell with its area in the aperture, with derivatives by heights, radius and pitch."""
+    heights, radius, pitch = (
+        random(*shape).requires_grad_(),
+        scalar(0.29).requires_grad_(),
+        scalar(0.075).requires_grad_(),
+    )
+    element = Element(Pixels(heights, pitch), radius, PLASTIC)
+    s = scene(element, size=4)
+    s = dataclasses.replace(s, grid=dataclasses.replace(s.grid, centre=vector(*middle)))
+    sums = pupil.prepare_pixels(s, 3, 2, parts=parts)
+    assert 0 < len(sums.rows) < shape[0] * shape[1]  # some are cut, and some are whole
+    x, y, cell = pupil._lattice(s, parts)
+    edges = [torch.cat([c - 0.5 * cell, c[-1:] + 0.5 * cell]) / radius for c in (x, y)]
+    light = radius**2 * pupil._cell_areas(*edges) / (s.sensor_distance * math.sqrt(math.pi) * radius)
+    wavelengths = 1e-3 * s.wavelengths[:, None, None]
+    U = (
+        light
+        / wavelengths
+        * phasor(path(s.elements, *torch.broadcast_tensors(x, y[:, None]), s.wavelengths) / wavelengths)
+    )
+    U = sums.to_pixels.along_y @ U @ sums.to_pixels.along_x.mT
+    every, found = U.real**2 + U.imag**2, pupil.intensity(s, sums)
+    torch.testing.assert_close(found, every, rtol=0, atol=1e-13 * float(every.detach().max()))
+    weights = random(*every.shape)
+    by = [heights, radius, pitch]
+    slopes, wanted = (torch.autograd.grad((t * weights).sum(), by, retain_graph=True) for t in (found, every))
+    for slope, other in zip(slopes, wanted, strict=True):
+        torch.testing.assert_close(slope, other, rtol=0, atol=1e-11 * float(other.abs().max()))

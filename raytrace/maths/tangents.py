@@ -96,6 +96,11 @@ def values_alone() -> Iterator[None]:
         _stopped.reset(token)
 
 
+def are_values_alone() -> bool:
+    """Whether results carry no derivatives by variables, as within `values_alone`."""
+    return _stopped.get()
+
+
 def _values(result: Any) -> Any:
     """The result of a function without tangents."""
     if isinstance(result, MovingTensor):

@@ -31,10 +31,9 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.aiming import aim_at_middle
 from raytrace.tracing.paraxial import axial_beam, cone_angle, object_distance_of
-from raytrace.tracing.trace import is_bent, steps
+from raytrace.tracing.trace import is_bent, points_at, steps
 
 _PARALLEL = 1e-15  # rad per mm, and other quantities that are 0 but for rounding
-_FIGURES = 8  # of the ray: two coordinates on the stop, three on the image, three of its direction there
 
 
 @value
@@ -95,15 +94,16 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     """
     wavelength = lens.primary if wavelength is None else wavelength
     near = _near(lens, wavelength)
-    moves, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
+    front, like = near.front, near.X
+    moves, kappa = torch.eye(2, dtype=like.dtype, device=like.device), front.vergence[..., None, None]
     parallel = near.behind(moves, 0 * moves)
     fan = near.behind(moves, kappa * moves)
     # Through the middle of the stop, A m + B t = 0, also where A = 0, as chief rays are parallel in object space: of
     # object points 1 mm off the base ray, over κ.
-    through = _inverse(near.A + kappa * near.B)
-    chief = near.behind(through @ near.B, -through @ near.A)
+    through = _inverse(front.A + kappa * front.B)
+    chief = near.behind(through @ front.B, -through @ front.A)
     # From the axial object point to the rim of the stop.
-    move = near.radius[..., None, None] * through @ near.Q
+    move = front.radius[..., None, None] * through @ front.Q
     rim = near.behind(move, kappa * move)
     exit_pupil, image = _closest(chief), _closest(fan)
     across = _at(rim, exit_pupil)
@@ -118,8 +118,8 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
         way_to_image=near.last,
         focal_length=_first(_sign(near.carried, -parallel[1]) * _over(1.0, _length(parallel[1]))),
         back_focal_distance=_first(_closest(parallel) + near.last[..., None]),
-        entrance_pupil_position=_first(torch.diagonal(near.E, dim1=-2, dim2=-1)),
-        entrance_pupil_diameter=_first(2 * near.radius[..., None] * _length(near.H_inverse)),
+        entrance_pupil_position=_first(torch.diagonal(front.E, dim1=-2, dim2=-1)),
+        entrance_pupil_diameter=_first(2 * front.radius[..., None] * _length(front.H_inverse)),
         exit_pupil_position=_first(exit_pupil),
         exit_pupil_diameter=_first(2 * _length(across)),
         image_distance=_first(image + near.last[..., None]),
@@ -130,7 +130,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
 
 def entrance_of(lens: Lens) -> Entrance:
     """The entrance of a bent lens for rays of the primary wavelength that fill the stop."""
-    near = _near(lens, lens.primary)
+    near = _front(lens, lens.primary)
     kappa = near.vergence
     first, second = torch.diagonal(near.E, dim1=-2, dim2=-1).unbind(-1)
     # The plane halfway between the images of the stop in both sections, if those are one; else that of the vertex.
@@ -142,41 +142,85 @@ def entrance_of(lens: Lens) -> Entrance:
     return Entrance(middle * near.launched[2], near.aim + middle * near.launched[:2], spread, turn, near.radius)
 
 
-class _Near(NamedTuple):
-    """The base ray, and derivatives of neighbouring rays by their start: matrices (..., rows, columns).
+class _Front(NamedTuple):
+    """The base ray up to the stop, and derivatives of neighbouring rays by their start: matrices (..., rows, columns).
 
     Columns are tangential and sagittal: rays moved across the base ray along the local y and x of the start, mm, or
-    turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop; X: (..., 3, 4) from
-    both to the displacement across the base ray at the image, D: to the direction in front of it. E: a ray turned by u
-    and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm, launched: (3, ...)
-    of the base ray in the plane of the vertex of surface 1; position, direction: (3, ...) and valid: (...) on the
-    image; last: (...) mm to it from the last real surface; carried: (..., 3, 2) the local y and x of the start behind
-    mirrors and turned axes; vergence: (...) 1/mm of the object from that plane; radius: (...) mm of the stop; n_image:
-    (...) n′.
+    turned towards them, radians. A, B: (..., 2, 2) from moves and turns to the y and x of the stop. E: a ray turned by
+    u and moved by -E u meets the middle of the stop. Q, H_inverse: A = Q H (polar). aim: (2, ...) mm, launched:
+    (3, ...) of the base ray in the plane of the vertex of surface 1; vergence: (...) 1/mm of the object from that
+    plane; radius: (...) mm of the stop.
     """
 
     A: Tensor
     B: Tensor
-    X: Tensor
-    D: Tensor
     E: Tensor
     Q: Tensor
     H_inverse: Tensor
     aim: Tensor
     launched: Tensor
+    vergence: Tensor
+    radius: Tensor
+
+
+class _Near(NamedTuple):
+    """The base ray up to the image, and derivatives of neighbouring rays as of `_Front`.
+
+    X: (..., 3, 4) from moves and turns to the displacement across the base ray at the image, D: to the direction in
+    front of it. position, direction: (3, ...) and valid: (...) on the image; last: (...) mm to it from the last real
+    surface; carried: (..., 3, 2) the local y and x of the start behind mirrors and turned axes; n_image: (...) n′.
+    """
+
+    front: _Front
+    X: Tensor
+    D: Tensor
     position: Tensor
     direction: Tensor
     valid: Tensor
     last: Tensor
     carried: Tensor
-    vergence: Tensor
-    radius: Tensor
     n_image: Tensor
 
     def behind(self, move: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
         """X and D (..., 3, k) of k rays that are moved and turned at the start, (..., 2, k) each."""
         X, D = (m[..., :2] @ move + m[..., 2:] @ turn for m in (self.X, self.D))
         return X, D
+
+
+@shared
+def _front(lens: Lens, wavelength: Tensor) -> _Front:
+    """By the trace to the stop, without the surfaces behind it."""
+    distance = object_distance_of(lens)
+    aim = _aim(lens, wavelength)
+    launched = _start_direction(aim, distance)
+    axes, on_stop = _axes(launched), points_at(lens, wavelength, (lens.stop,))
+
+    def traced(change: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        (position,), arrives = on_stop(_neighbours(aim, launched, axes, change))
+        return position.flip(0), (arrives,)
+
+    batch = broadcast_shape(aim.shape[1:], distance.shape, wavelength.shape, batch_shape(lens))
+    _, to_stop, _ = _linearised(traced, aim.new_zeros(4, *batch), (lens, wavelength), 2)
+    return _front_of(lens, aim, launched, to_stop)
+
+
+def _neighbours(aim: Tensor, launched: Tensor, axes: tuple[Tensor, Tensor], change: Tensor) -> Rays:
+    """Rays (3, K, ...) at the start, moved and turned by changes (4, K, ...) along the axes."""
+    t, s, turn_t, turn_s = change
+    up, right = (axis[:, None] for axis in axes)
+    position = torch.stack([*aim, torch.zeros_like(aim[0])])[:, None]
+    return start(position + t * up + s * right, launched[:, None] + turn_t * up + turn_s * right)
+
+
+def _front_of(lens: Lens, aim: Tensor, launched: Tensor, to_stop: Tensor) -> _Front:
+    """to_stop: (2, 4, ...) from moves and turns to the y and x of the stop."""
+    distance, to_stop = object_distance_of(lens), torch.movedim(to_stop, (0, 1), (-2, -1))
+    A, B = to_stop[..., :2], to_stop[..., 2:]
+    Q, H_inverse = _polar(A)
+    # Not 1/(distance · length), whose derivative by the length is 0 · inf for an object at infinity.
+    vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
+    radius = _stop_radius(lens, H_inverse, _over(A, vergence[..., None, None])[..., 0] + B[..., 0])
+    return _Front(A, B, _inverse(A) @ B, Q, H_inverse, aim, launched, vergence, radius)
 
 
 @shared
@@ -189,10 +233,7 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     real = max([k for k in range(1, image) if not lens.surfaces[k].is_break], default=image - 1)
 
     def traced(change: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
-        t, s, turn_t, turn_s = change
-        up, right = (axis[:, None] for axis in axes)
-        position = torch.stack([*aim, torch.zeros_like(aim[0])])[:, None]
-        rays = start(position + t * up + s * right, launched[:, None] + turn_t * up + turn_s * right)
+        rays = _neighbours(aim, launched, axes, change)
         arrives, ways = rays.valid, []
         for crossing in steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength):
             arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
@@ -202,22 +243,16 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
         return moving, (arrives, last.position, *(way.direction for way in ways))
 
     batch = broadcast_shape(aim.shape[1:], distance.shape, wavelength.shape, batch_shape(lens))
-    figures, slopes, (valid, last, *ways) = _linearised(traced, aim.new_zeros(4, *batch), (lens, wavelength))
+    figures, slopes, (valid, last, *ways) = _linearised(traced, aim.new_zeros(4, *batch), (lens, wavelength), 8)
     position, direction = figures[2:5], figures[5:]
     to_stop, moved, D = slopes.split((2, 3, 3))
     X = moved - dot(moved, direction[:, None]) * direction[:, None]
-    X, D, to_stop = (torch.movedim(part, (0, 1), (-2, -1)) for part in (X, D, to_stop))
-    A, B = to_stop[..., :2], to_stop[..., 2:]
-    Q, H_inverse = _polar(A)
-    # Not 1/(distance · length), whose derivative by the length is 0 · inf for an object at infinity.
-    vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
+    X, D = (torch.movedim(part, (0, 1), (-2, -1)) for part in (X, D))
     valid, last, ways = valid[0], last[:, 0], [way[:, 0] for way in ways]
     return _Near(
-        A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, launched, position, direction, valid,
+        _front_of(lens, aim, launched, to_stop), X, D, position, direction, valid,
         last=_way_to_image(lens.surfaces[real:], last, position, direction),
         carried=_carried(lens, launched, axes, ways),
-        vergence=vergence,
-        radius=_stop_radius(lens, H_inverse, _over(A, vergence[..., None, None])[..., 0] + B[..., 0]),
         n_image=indices[-1],
     )  # fmt: skip
 
@@ -255,9 +290,10 @@ def _axes(launched: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _linearised(
-    function: Callable[[Tensor], tuple[Tensor, tuple[Tensor, ...]]], point: Tensor, given: object
+    function: Callable[[Tensor], tuple[Tensor, tuple[Tensor, ...]]], point: Tensor, given: object, figures_count: int
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
-    """f (m, ...) at a point (n, ...), its Jacobian (m, n, ...), and f's second result; given: numbers f depends on."""
+    """f (m, ...) at a point (n, ...), its Jacobian (m, n, ...), and f's second result; given: numbers f depends on;
+    figures_count: m."""
     # One backward pass of m copies: in forward mode, tangents of plain numbers cost four times as much as the trace.
 
     def units(count: int) -> Tensor:
@@ -270,10 +306,10 @@ def _linearised(
         return figures[:, 0], slopes, others
     recorded = torch.is_grad_enabled() and any(map(varies, pytree.tree_leaves(given)))
     with torch.enable_grad():
-        copies = point[:, None].repeat(1, _FIGURES, *(1,) * (point.dim() - 1)).requires_grad_()
+        copies = point[:, None].repeat(1, figures_count, *(1,) * (point.dim() - 1)).requires_grad_()
         figures, others = function(copies)
         # Of a scalar: with weights `grad` imports sympy, 1.4 s.
-        (slopes,) = torch.autograd.grad((figures * units(_FIGURES)).sum(), copies, create_graph=recorded)
+        (slopes,) = torch.autograd.grad((figures * units(figures_count)).sum(), copies, create_graph=recorded)
     if not recorded:
         figures, *others = (part.detach() for part in (figures, *others))
     return figures[:, 0], slopes.transpose(0, 1), others

@@ -13,7 +13,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from raytrace.maths.numerics import broadcast_shape, in_forward_mode, in_transform, with_batch_axes
-from raytrace.maths.tangents import MovingTensor, tangents_of, value_of, with_tangents
+from raytrace.maths.tangents import MovingTensor, are_values_alone, tangents_of, value_of, with_tangents
 from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.poses import Gap, Turn, passage
@@ -426,6 +426,10 @@ Inputs = tuple[Tensor, Tensor, Tensor | None, Tensor]
 Changes = tuple[Tensor, Tensor, Tensor | None]
 
 
+#: Structures, numbers and tables of surfaces, of calls that differ in the rays alone: see `task_of`.
+Prepared: TypeAlias = dict[Any, Any]
+
+
 class Task(NamedTuple):
     """Input of the compiled trace: contiguous rays, and the numbers (rows, K) in a table."""
 
@@ -442,13 +446,19 @@ def task_of(
     side: int = 1,
     gap: Tensor | Gap | None = None,
     wavelength: Tensor | None = None,
+    prepared: Prepared | None = None,
 ) -> Task | None:
-    """A batch as the compiled trace takes it; arguments as for `steps`.
+    """A batch as the compiled trace takes it; arguments as for `steps`, prepared: as for `trace_surfaces`.
 
     None for an empty batch, and where a number has another dtype than the rays or varies along the last axis.
     """
     wavelength = None if wavelength is None else wavelength.to(rays.direction.dtype)
-    structure, numbers = structure_of(surfaces, indices, side, gap, wavelength)
+    # Poses of tilted surfaces are hundreds of operations: of a search, as many as its rays. They differ by derivatives.
+    prepared = {} if prepared is None or in_transform() or in_forward_mode() else prepared
+    kind = rays.direction.dtype, torch.is_grad_enabled(), are_values_alone()
+    if kind not in prepared:
+        prepared[kind] = *structure_of(surfaces, indices, side, gap, wavelength), {}
+    structure, numbers, tables = prepared[kind]
     parts = [rays.position[0], rays.direction[0], rays.valid, *([] if rays.opl is None else [rays.opl]), *numbers]
     shape = broadcast_shape(*{part.shape for part in parts})
     if 0 in shape or any(n.dtype != rays.direction.dtype or (n.dim() and n.shape[-1] != 1) for n in numbers):
@@ -457,7 +467,14 @@ def task_of(
         with_batch_axes(x, len(shape)).expand(3, *shape).contiguous() for x in (rays.position, rays.direction)
     )
     opl = None if rays.opl is None else rays.opl.expand(shape).contiguous()
-    # A row for all rays of the last axis; numbers that are the same in all rows are put into them together.
+    if shape[:-1] not in tables:
+        tables[shape[:-1]] = _table_of(numbers, shape[:-1])
+    return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, tables[shape[:-1]]))
+
+
+def _table_of(numbers: Sequence[Tensor], shape: Sequence[int]) -> Tensor:
+    """The table (rows, K) of K numbers, a row for all rays of the last axis of a batch (*shape, P)."""
+    # Numbers that are the same in all rows are put into them together.
     single = [k for k, n in enumerate(numbers) if n.numel() == 1]
     several = [k for k, n in enumerate(numbers) if n.numel() > 1]
     parts = []
@@ -465,14 +482,14 @@ def task_of(
         common = [n if n.dim() == 0 else n.reshape(()) for n in map(numbers.__getitem__, single)]
         parts.append(torch.stack(common)[None])
     if several:
-        rows = torch.stack([numbers[k][..., 0].expand(shape[:-1]) for k in several], -1)
+        rows = torch.stack([numbers[k][..., 0].expand(shape) for k in several], -1)
         parts.append(rows.reshape(-1, len(several)))
     table = parts[0]
     if len(parts) == 2:
         places = {k: place for place, k in enumerate((*single, *several))}
         columns = torch.tensor([places[k] for k in range(len(numbers))], device=table.device)
         table = torch.cat([table.expand(len(parts[1]), -1), parts[1]], -1)[:, columns]
-    return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, table))
+    return table
 
 
 #: surfaces, rays, indices, side, gap -> the rays behind the last surface, by torch alone.
@@ -488,12 +505,13 @@ def trace_compiled(
     gap: Tensor | Gap | None,
     wavelength: Tensor | None = None,
     eager: Eager,
+    prepared: Prepared | None = None,
 ) -> Rays | None:
     """The rays behind the last of the surfaces; None for a batch that `task_of` refuses.
 
-    Arguments as for `trace.steps`; eager: the same trace by torch alone, for derivatives of derivatives.
+    Arguments as for `task_of`; eager: the same trace by torch alone, for derivatives of derivatives.
     """
-    task = task_of(surfaces, rays, indices=indices, side=side, gap=gap, wavelength=wavelength)
+    task = task_of(surfaces, rays, indices=indices, side=side, gap=gap, wavelength=wavelength, prepared=prepared)
     if task is None:
         return None
     if any(isinstance(part, MovingTensor) for part in task.inputs):

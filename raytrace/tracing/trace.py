@@ -27,6 +27,7 @@ from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, is_posed, is_round
 from raytrace.tracing.compiled import (
     Changes,
+    Prepared,
     Pushed,
     Task,
     forward,
@@ -229,8 +230,10 @@ def trace_surfaces(
     wavelength: Tensor | None = None,
     side: int = 1,
     gap: Tensor | Gap | None = None,
+    prepared: Prepared | None = None,
 ) -> Rays:
-    """The rays behind the last of the surfaces; arguments as for `steps`.
+    """The rays behind the last of the surfaces; arguments as for `steps`. prepared: of earlier calls that differ in the
+    rays alone; the call adds its own.
 
     The compiled engine traces the runs of surfaces that it supports, where it pays: see `tracing.compiled`.
     """
@@ -242,7 +245,8 @@ def trace_surfaces(
         passage = Passage(indices=indices[first : last + 1], wavelength=wavelength, side=side, gap=gap)
         end = None
         if expressible and uses_compiled(rays, indices[first], last - first):
-            end = trace_compiled(surfaces[first:last], rays, **passage, eager=_eager)
+            of_run = None if prepared is None else prepared.setdefault(first, {})
+            end = trace_compiled(surfaces[first:last], rays, **passage, eager=_eager, prepared=of_run)
         rays = _eager(surfaces[first:last], rays, **passage) if end is None else end
         side = side * side_behind(surfaces[first:last])
         gap, first = gap_behind(surfaces[last - 1]), last
@@ -368,17 +372,17 @@ def rays_at(
     """
     indices = media(lens, wavelength) if indices is None else indices
     surfaces = lens.surfaces[0], *_unclipped(sequence_of(lens))
-    runs: list[tuple[Sequence[Surface], Passage]] = []
+    runs: list[tuple[Sequence[Surface], Passage, Prepared]] = []
     side = side_behind(surfaces[: first + 1])
     for last in numbers:
         run, gap = surfaces[first + 1 : last + 1], gap_behind(lens.surfaces[first]) if first else None
-        runs.append((run, Passage(indices=indices[first : last + 1], wavelength=wavelength, side=side, gap=gap)))
+        runs.append((run, Passage(indices=indices[first : last + 1], wavelength=wavelength, side=side, gap=gap), {}))
         first, side = last, side * side_behind(run)
 
     def trace(rays: Rays) -> list[Rays]:
         each = []
-        for run, passage in runs:
-            rays = trace_surfaces(run, rays, **passage)
+        for run, passage, prepared in runs:
+            rays = trace_surfaces(run, rays, **passage, prepared=prepared)
             each.append(rays)
         return each
 

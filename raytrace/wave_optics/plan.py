@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -503,8 +503,14 @@ def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | No
     D, W = s.kernels
     K = s.size * nodes
     cells = samples + 6 if kind == "smooth" else samples
-    flops = 2 * D * W * (K * cells**2 + K**2 * cells + 30 * cells**2) * (1 if kind != "flat" else 4)
-    memory = s.bytes * (D * W * (6 * cells**2 + 4 * K * cells + 8 * K**2) + 4 * W * K * cells)
+    if kind == "flat":  # whole pixels, and parts × parts cells of about 4 n pixels that the edge cuts
+        n = samples // parts
+        sums = K * n**2 + 4 * n * parts**2 * K + K**2 * (cells + n)
+        flops = 8 * D * W * (sums + 8 * K * inner * cells) + 60 * W * n * (n + 4 * parts**2)
+        memory = s.bytes * (2 * D * W * K * (8 * n * parts + 6 * cells + 4 * K) + W * n * (20 * n + 40 * parts**2))
+    else:
+        flops = 2 * D * W * (K * cells**2 + K**2 * cells + 30 * cells**2)
+        memory = s.bytes * (D * W * (6 * cells**2 + 4 * K * cells + 8 * K**2) + 4 * W * K * cells)
     return Plan("pupil", samples, nodes, error, flops, memory, cells=kind, extent=extent, inner=inner, parts=parts)
 
 
@@ -590,10 +596,14 @@ def _aligned(scene: WaveScene, s: Setting, samples: int) -> tuple[int, float]:
 
 def behind(scene: WaveScene, plan: Plan) -> Tensor | None:
     """The light behind the elements that all depths and windows of a scene share; None where the plan has none."""
-    return pupil.behind_pixels(scene, plan.parts) if plan.engine == "pupil" and plan.cells == "flat" else None
+    return pupil.behind_pixels(scene) if plan.engine == "pupil" and plan.cells == "flat" else None
 
 
-def _pupil_sums(scene: WaveScene, plan: Plan, behind: Tensor | None) -> pupil.PupilSums | mixed.MixedSums:
+#: Sums of the pupil engine: of cells, of flat pixels, and behind a round part.
+_Sums: TypeAlias = pupil.PupilSums | pupil.PixelSums | mixed.MixedSums
+
+
+def _pupil_sums(scene: WaveScene, plan: Plan, behind: Tensor | None) -> _Sums:
     if plan.cells == "mixed":
         return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
     if plan.cells == "flat":
@@ -601,7 +611,7 @@ def _pupil_sums(scene: WaveScene, plan: Plan, behind: Tensor | None) -> pupil.Pu
     return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
 
 
-def _pupil_kernels(scene: WaveScene, sums: pupil.PupilSums | mixed.MixedSums, plan: Plan) -> Tensor:
+def _pupil_kernels(scene: WaveScene, sums: _Sums, plan: Plan) -> Tensor:
     light = mixed.intensity(scene, sums) if isinstance(sums, mixed.MixedSums) else pupil.intensity(scene, sums)
     return integrate(light, sums.to_pixels.pixel, scene.grid.pitch)
 

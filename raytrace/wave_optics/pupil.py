@@ -43,14 +43,13 @@ class ToPixels:
 class PupilSums:
     """Sums that do not depend on the heights: the matrices of the transform and the cells of the aperture.
 
-    x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell, or behind the element as of
-    `behind_pixels`, where x and y are None; sphere: (D, N, N) mm or None where the matrices hold it.
+    x, y: (N, N) mm, centres of the cells; weight: (W, N, N), light through a cell; sphere: (D, N, N) mm.
     """
 
-    x: Tensor | None
-    y: Tensor | None
+    x: Tensor
+    y: Tensor
     weight: Tensor
-    sphere: Tensor | None
+    sphere: Tensor
     to_pixels: ToPixels
 
 
@@ -98,28 +97,87 @@ def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> ToPixels:
     return ToPixels(along(u), along(v), pixel, folded)
 
 
+@value
+class PixelSums:
+    """The same of one map of flat pixels, n × n of which cover the aperture; its edge cuts M of them.
+
+    x, y: (n, n) mm, centres of the pixels, or None with `waves` (W, n, n), of `behind_pixels`; whole: (W, n, n) light
+    through each cell of the pixels that lie inside the aperture, 0 of others; rows, columns: (M,) of the cut ones, cut:
+    (W, M, parts, parts) light through their cells. The matrices of `to_pixels` have the cells of all pixels in turn.
+    """
+
+    x: Tensor | None
+    y: Tensor | None
+    waves: Tensor | None
+    whole: Tensor
+    rows: Tensor
+    columns: Tensor
+    cut: Tensor
+    to_pixels: ToPixels
+
+
 def prepare_pixels(
     scene: WaveScene, nodes: int, inner: int, *, parts: int = 1, behind: Tensor | None = None
-) -> PupilSums:
-    """The same for one map of flat pixels, each cut into parts × parts cells for the edge of the aperture.
+) -> PixelSums:
+    """The same for one map of flat pixels, each of parts × parts cells for the edge of the aperture.
 
     inner: Gauss nodes for the paraboloid and the plane wave across a cell; behind: of `behind_pixels`, if it is known.
     """
-    x, y, pitch = _lattice(scene, parts)
+    fine_x, fine_y, cell = _lattice(scene, parts)
     u, v, pixel = sub_pixels(scene.grid, nodes)
-    along_x, along_y = (_across_pixels(scene, centre, s, pitch, inner) for centre, s in ((x, u), (y, v)))
-    if behind is not None:
-        return PupilSums(None, None, behind, None, ToPixels(along_x, along_y, pixel))
-    weight = _light_of_pixels(scene, x, y, pitch)
+    along_x, along_y = (_across_pixels(scene, centre, s, cell, inner) for centre, s in ((fine_x, u), (fine_y, v)))
+    x, y, pitch = _lattice(scene, 1)
+    R = aperture(scene)
+    # Light per area, of each wavelength.
+    light = 1 / (scene.sensor_distance * math.sqrt(math.pi) * R) / millimetres(scene)
+    far, near = (
+        torch.hypot(
+            *torch.broadcast_tensors(
+                *((c.detach().abs() + side * pitch.detach()).clamp_min(0) for c in (x, y[:, None]))
+            )
+        )
+        for side in (0.5, -0.5)
+    )
+    is_whole = far < R.detach()
+    rows, columns = torch.nonzero(~is_whole & (near < R.detach())).unbind(1)
+    steps = pitch * (torch.arange(parts + 1, dtype=pitch.dtype, device=pitch.device) / parts - 0.5)
+    edges_x, edges_y = ((centre[:, None] + steps).double() / R for centre in (x[columns], y[rows]))
+    cut = _areas_between(edges_x[:, None], edges_y[..., None]).to(light) * R**2
+    whole = light[:, None, None] * torch.where(is_whole, cell * cell, 0.0)
     x, y = torch.broadcast_tensors(x, y[:, None])
-    return PupilSums(x, y, weight, None, ToPixels(along_x, along_y, pixel))
+    places: tuple[Tensor | None, Tensor | None] = (x, y) if behind is None else (None, None)
+    matrices = ToPixels(along_x, along_y, pixel)
+    return PixelSums(*places, behind, whole, rows, columns, light[:, None, None, None] * cut, matrices)
 
 
-def behind_pixels(scene: WaveScene, parts: int) -> Tensor:
-    """Light (W, N, N) in the cells of `prepare_pixels` with the phase of the element, for all depths and windows."""
-    x, y, pitch = _lattice(scene, parts)
-    weight = _light_of_pixels(scene, x, y, pitch)
-    return _delayed(scene, weight, *torch.broadcast_tensors(x, y[:, None]))
+def behind_pixels(scene: WaveScene) -> Tensor:
+    """Phasors (W, n, n) of the pixels of `prepare_pixels`, for all depths and windows."""
+    x, y, _ = _lattice(scene, 1)
+    return _phasor_of(scene, *torch.broadcast_tensors(x, y[:, None]))
+
+
+def _light_of_pixels(scene: WaveScene, sums: PixelSums) -> Tensor:
+    """`light_of` pixels: the cells of one pixel have one height, so that those of whole pixels are summed beforehand,
+
+        U = Σ_whole w_p Σ_j b_j Σ_i a_i + Σ_j b_j Σ_cut w_p Σ_i c_ij a_i
+
+    with a, b the matrices along x and y. Cells of cut pixels alone are summed with their areas c, row by row.
+    """
+    if sums.waves is None:
+        assert sums.x is not None
+        assert sums.y is not None
+        waves = _phasor_of(scene, sums.x, sums.y)
+    else:
+        waves = sums.waves
+    (n_y, n_x), parts = sums.whole.shape[-2:], sums.cut.shape[-1]
+    along_x, along_y = sums.to_pixels.along_x, sums.to_pixels.along_y
+    cells_x, cells_y = along_x.unflatten(-1, (n_x, parts)), along_y.unflatten(-1, (n_y, parts))
+    U = cells_y.sum(-1) @ (sums.whole * waves) @ cells_x.sum(-1).mT
+    cut = sums.cut * waves[:, sums.rows, sums.columns, None, None]
+    each = cut @ cells_x.movedim(2, -1)[:, :, sums.columns]  # (D, W, M, parts, X)
+    lines = each.new_zeros(*each.shape[:2], n_y, *each.shape[3:]).index_add(2, sums.rows, each)
+    U = U + along_y @ lines.flatten(2, 3)
+    return U.real**2 + U.imag**2
 
 
 def _lattice(scene: WaveScene, parts: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -132,24 +190,15 @@ def _lattice(scene: WaveScene, parts: int) -> tuple[Tensor, Tensor, Tensor]:
     return x, y, pitch
 
 
-def _light_of_pixels(scene: WaveScene, x: Tensor, y: Tensor, pitch: Tensor) -> Tensor:
-    """Light (W, Y, X) through the part of each cell that lies in the aperture."""
-    R = aperture(scene)
-    weight = covered(x, y, pitch, R) / (scene.sensor_distance * math.sqrt(math.pi) * R)
-    return weight / millimetres(scene)[:, None, None]
+def _phasor_of(scene: WaveScene, x: Tensor, y: Tensor) -> Tensor:
+    """Phasors (W, ...) of the path of the elements at x, y (...) mm."""
+    return phasor(path(scene.elements, x, y, scene.wavelengths) / millimetres(scene)[:, None, None])
 
 
-def _delayed(scene: WaveScene, weight: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    waves = path(scene.elements, x, y, scene.wavelengths)
-    return weight * phasor(waves / millimetres(scene)[:, None, None])
-
-
-def intensity(scene: WaveScene, sums: PupilSums) -> Tensor:
+def intensity(scene: WaveScene, sums: "PupilSums | PixelSums") -> Tensor:
     """Light per mm² (D, W, Y, X) at the nodes of the pixels, 1 = all through the aperture."""
-    if sums.x is None or sums.y is None:
-        return light_of(scene, sums.to_pixels, sums.weight)
-    if sums.sphere is None:
-        return light_of(scene, sums.to_pixels, _delayed(scene, sums.weight, sums.x, sums.y))
+    if isinstance(sums, PixelSums):
+        return _light_of_pixels(scene, sums)
     waves = residual(scene, sums.x, sums.y, sums.sphere)
     return light_of(scene, sums.to_pixels, sums.weight * phasor(waves / millimetres(scene)[:, None, None]))
 
@@ -210,20 +259,19 @@ def smooth_cells(samples: int) -> np.ndarray:
     return share @ fine @ share.T
 
 
-def covered(x: Tensor, y: Tensor, pitch: Tensor, radius: Tensor) -> Tensor:
-    """Area (Y, X) mm² of square pixels around x (X), y (Y) that lies in a disc around the axis."""
-    edges = [torch.cat([c - 0.5 * pitch, c[-1:] + 0.5 * pitch]).double() / radius for c in (x, y)]
-    return _cell_areas(*edges).to(x) * radius**2
-
-
 def _cell_areas(x: Tensor, y: Tensor) -> Tensor:
-    """Area of the unit disc between edges x (X + 1) and y (Y + 1), by the area up to each corner."""
+    """Area of the unit disc between edges x (X + 1) and y (Y + 1)."""
+    return _areas_between(x, y[:, None])
+
+
+def _areas_between(x: Tensor, y: Tensor) -> Tensor:
+    """Areas (..., Y, X) of the unit disc between edges x (..., 1, X + 1), y (..., Y + 1, 1), by those up to corners."""
     # Short of 1 by less than counts, where the two terms of the cap have infinite slopes that cancel.
-    a, b = torch.abs(x).clamp(max=1 - 1e-12), torch.abs(y)[:, None].clamp(max=1 - 1e-12)
+    a, b = torch.abs(x).clamp(max=1 - 1e-12), torch.abs(y).clamp(max=1 - 1e-12)
     cap = [safe_sqrt(1 - c * c) * c + torch.asin(c) for c in (a, b)]
     outside = 0.5 * (cap[0] + cap[1] - 0.5 * math.pi)
-    quadrant = torch.where(a * a + b * b <= 1, a * b, outside) * torch.sign(x) * torch.sign(y)[:, None]
-    return quadrant.diff(dim=0).diff(dim=1).clamp(min=0.0)
+    quadrant = torch.where(a * a + b * b <= 1, a * b, outside) * torch.sign(x) * torch.sign(y)
+    return quadrant.diff(dim=-2).diff(dim=-1).clamp(min=0.0)
 
 
 def waves_at(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
