@@ -50,4 +50,4 @@ def _largest(around: Tensor) -> Tensor:
     scale = _EQUAL * around.abs().max()
     fine = torch.fft.irfft(torch.fft.rfft(around), _FINE) * (_FINE / count)
     best = around if float(fine.max()) <= float(around.max() + scale) else fine
-    return (best >= best.max() - (scale if best is around else 0)).double().argmax().double() * (360.0 / len(best))
+    return (best >= best.max() - scale).double().argmax().double() * (360.0 / len(best))
