@@ -356,6 +356,7 @@ NEEDED = {
     "jacobian": {"vary": "curvature:1"},
     "sag": {"surface": 3},
     "footprint": {"surface": 3},
+    "depth-of-field": {"blur": 0.1},
     "tolerance": {"limits": "radius=0.1%", "trials": 20},
 }
 
