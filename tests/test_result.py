@@ -61,7 +61,7 @@ def results() -> dict[str, tuple]:
             "x_low x_high y_low y_high centroid_y reach passed_percent",
         ),
         "intercepts": (
-            lambda: rt.intercepts(double, each=True, rays="chief upper", **fields),
+            lambda: rt.intercepts(double, each=True, rays="chief right", **fields),
             "x y z l m n incidence refraction",
         ),
         "depth of field": (

@@ -466,8 +466,8 @@ def at_infinity(lens: Lens) -> dict[str, str]:
     """Entries of FirstOrder that are infinite in practice, and the word of it.
 
     effective_focal_length: "afocal", and both focal distances "infinite"; entrance_pupil_position: "telecentric", chief
-    rays are parallel in object space; exit_pupil_position: "telecentric", in image space. Lengths are compared with that of the lens, object to image
-    without the object distance.
+    rays are parallel in object space; exit_pupil_position: "telecentric", in image space. Lengths are compared with
+    that of the lens, object to image without the object distance.
     """
     data = first_order(lens)
     length = max(sum(abs(float(surface.thickness.detach())) for surface in lens.surfaces[1:-1]), 1.0)
