@@ -102,8 +102,8 @@ class LensComparison(Result):
     other: Lens
     analysis: str
     names: tuple[str, str]
-    first: Result
-    second: Result
+    first: Any
+    second: Any
 
     @property
     def COLUMNS(self) -> Sequence[Column]:  # type: ignore[override]
@@ -264,7 +264,7 @@ def _first_order(lens: Lens) -> dict[str, Tensor]:
 
 
 def _curves(pair: LensComparison, plot: Curves) -> Figure:
-    """The curves of both lenses: a panel for each of `plot.panels`, one colour a lens, dashes for the rest."""
+    """The curves of both lenses: a panel for each of its `panels`, one colour a lens, dashes for the rest."""
     results = [getattr(result, "drawn", lambda result=result: result)() for result in (pair.first, pair.second)]
     tables = [flat({**result.columns(), **_summary(result)}) for result in results]
     keys = {"field": ("field_x", "field_y"), "wavelength": ("wavelength",)}
@@ -328,7 +328,7 @@ def _curves(pair: LensComparison, plot: Curves) -> Figure:
 
 def _summary(result: Any) -> dict[str, Tensor]:
     """Columns of the summary over the field, of results that have one along the same fields."""
-    summary = getattr(result, "summary", dict)()
+    summary: dict[str, Tensor] = getattr(result, "summary", dict)()
     table = result.columns()
     return {name: column[..., None] for name, column in summary.items() if name not in table and column.dim() == 1}
 
@@ -478,8 +478,8 @@ def _draw_maps(pair: LensComparison) -> Figure:
 
 def _draw_sums(pair: LensComparison) -> Figure:
     """Bars of the sums of the Seidel aberrations of the outermost field."""
-    sums = [flat(result.summary()) for result in (pair.first, pair.second)]  # type: ignore[attr-defined]
-    names = [name for name in pair.first.names if len(pair.first.lens.wavelengths) > 1 or name[0] != "C"]  # type: ignore[attr-defined]
+    sums = [flat(result.summary()) for result in (pair.first, pair.second)]
+    names = [name for name in pair.first.names if len(pair.first.lens.wavelengths) > 1 or name[0] != "C"]
     figure = new_figure(6.0, 3.8)
     panel: Axes = ruled(figure.add_subplot())
     for k, (table, colour) in enumerate(zip(sums, COLOURS, strict=True)):
@@ -487,7 +487,7 @@ def _draw_sums(pair: LensComparison) -> Figure:
         panel.bar(place, [table[name][-1] for name in names], width=0.38, color=colour)
     panel.set_xticks(range(len(names)), names)
     panel.axhline(0, color=GREY, linewidth=0.6)
-    panel.set_ylabel(f"sum over the surfaces ({pair.first.unit})")  # type: ignore[attr-defined]
+    panel.set_ylabel(f"sum over the surfaces ({pair.first.unit})")
     return _finished(figure, pair)
 
 

@@ -7,6 +7,7 @@ A section is a row of KINDS_OF_SECTIONS. Its numbers and figures are the results
 import contextlib
 import dataclasses
 import datetime
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -193,8 +194,8 @@ def _prescription(request: _Request, writer: _Writer) -> None:
     if operands and len(request.lenses) > 1:
         writer.blocks.append(Heading("Numbers that differ between configurations"))
         heads = ["operand", *(f"configuration {lens.current_configuration}" for lens in request.lenses)]
-        rows = [(str(operand), *(_cell(entry) for entry in operand.values())) for operand in operands]
-        writer.blocks.append(rows_grid(heads, rows, "l" + "r" * len(request.lenses)))
+        differing = [(str(operand), *(_cell(entry) for entry in operand.values())) for operand in operands]
+        writer.blocks.append(rows_grid(heads, differing, "l" + "r" * len(request.lenses)))
         writer.blocks.append(
             f"The table of surfaces is that of configuration {request.lenses[0].current_configuration}."
         )
@@ -238,7 +239,7 @@ def _layout(request: _Request, writer: _Writer) -> None:
     for lens in request.lenses:
         name = f"Configuration {lens.current_configuration}" if several else "Layout"
         caption = name if several else ""
-        writer.analysis(name, lambda lens=lens: layout(lens, **request.at_fields), tables=False, caption=caption)
+        writer.analysis(name, functools.partial(layout, lens, **request.at_fields), tables=False, caption=caption)
 
 
 def _each(
@@ -250,9 +251,7 @@ def _each(
         for lens in request.lenses:
             start = len(writer.blocks)
             for name, make in analyses:
-                writer.analysis(
-                    name + _of(request, lens), lambda lens=lens, make=make: make(lens, request), tables=tables
-                )
+                writer.analysis(name + _of(request, lens), functools.partial(make, lens, request), tables=tables)
             if len(request.lenses) > 1 and len(writer.blocks) > start:
                 writer.blocks.insert(start, Heading(f"Configuration {lens.current_configuration}"))
 
@@ -301,7 +300,7 @@ def _temperature(request: _Request, writer: _Writer) -> None:
     options = {name: request.options[name] for name in ("temperatures", "mount")}
     for lens in request.lenses:
         name = "Over temperature" + _of(request, lens)
-        writer.analysis(name, lambda lens=lens: thermal(lens, samples=_TEMPERATURES, **options, **request.at_fields))
+        writer.analysis(name, functools.partial(thermal, lens, samples=_TEMPERATURES, **options, **request.at_fields))
 
 
 def _drawings(request: _Request, writer: _Writer) -> None:
