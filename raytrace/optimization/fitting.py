@@ -270,7 +270,7 @@ class Fit(ABC):
                 for predicted, candidate in (self.candidates(design, item) if k else each[item])[:TRIED]
             ]
             trials.sort(key=lambda trial: trial[0])
-            ends = []
+            ends: list[tuple[Design, list[FitStep]]] = []
             for predicted, k, candidate in trials[: TRIED + len(beam)]:
                 if ends and time.monotonic() > self.until:
                     break

@@ -132,7 +132,7 @@ def optimize(
             raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     vary, spaces = without_spacers(lens, vary)
     if spaces:
-        given = {"log": log, "checkpoint": checkpoint, "resume": resume, "loss": loss}
+        given: dict[str, object] = {"log": log, "checkpoint": checkpoint, "resume": resume, "loss": loss}
         given |= {"stock": stock, "test_plates": test_plates}
         given |= {"merit": merit} if callable(merit) else {}
         for name, setting in given.items():
@@ -190,8 +190,8 @@ def optimize(
     else:
         quantity = quantity_of(of)
     if loss is not None and (chosen or as_built is not None):
-        given = option("vary", "glass") if chosen else option("as_built")
-        raise NoProblem(f"{given} goes with a merit of rows, not with a function: leave it out")
+        words = option("vary", "glass") if chosen else option("as_built")
+        raise NoProblem(f"{words} goes with a merit of rows, not with a function: leave it out")
     rows, held = specified(lens, merit if loss is None else first or "spot", hold)
     conditions, of_rows = conditions_in_unit(lens, held, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)

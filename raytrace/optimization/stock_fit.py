@@ -27,7 +27,7 @@ from raytrace.tracing.geometry import light_diameter
 from raytrace.words import RaytraceError, option
 
 _NEAR = 3.0  # largest factor between the powers of an element and of its part
-#: Parts, in one orientation, that an expansion by the numbers of the element selects, and the nearest in power.
+#: Parts, in one orientation, that an expansion by the numbers of the element selects; the nearest weaker and stronger.
 _SELECTED, _NEAREST = 8, 4
 _TIGHT = 1e-3  # relative part by which the light may exceed a part
 
@@ -155,7 +155,10 @@ class StockFit(Fit):
         ]
         estimates = self._estimates(design, item, every)
         order = [int(k) for k in np.argsort(estimates, kind="stable")]
-        some = dict.fromkeys([*order[:_SELECTED], *range(min(len(every), 2 * _NEAREST))])
+        efl, _ = self.of_element[item]
+        weaker = [k for k, candidate in enumerate(every) if candidate.part.figures.efl / efl > 1]
+        stronger = [k for k in range(len(every)) if k not in weaker]
+        some = dict.fromkeys([*order[:_SELECTED], *weaker[: 2 * _NEAREST], *stronger[: 2 * _NEAREST]])
         trials = [(self._predicted(design, item, every[k]), every[k]) for k in some]
         trials = [(merit, candidate) for merit, candidate in trials if math.isfinite(merit)]
         if not trials:
