@@ -41,6 +41,7 @@ def semi_diameters(
             raise BadEdit(f"semi_diameters: {option(name, str(length))}: expected a length in mm, as 0.5")
     pair = margin if margin is None or isinstance(margin, Sequence) else (margin, 0.0)
     faces = {k for ends in lens_elements(lens) for k in ends if k < last}
+    faces |= {k for k, surface in enumerate(lens.surfaces) if surface.is_mirror}
     listed = list(lens.surfaces)
     for k in faces.intersection(chosen):
         if chip_zone is not None:

@@ -40,9 +40,9 @@ def lens(
     rows: mappings, or a DataFrame: radius (mm, inf is a plane) or curvature (1/mm), thickness (mm to the next vertex,
     of the last row to the sensor), glass (a name, an index, (nd, Vd) or a Glass behind the surface; air by default,
     "MIRROR" reflects; of the last row the medium of the image), conic, coefficients (of r², r⁴, … in mm^(1-2j)),
-    semi_diameter, apertures, comment; decentres x, y, z (mm) and tilts tilt_x, tilt_y, tilt_z (degrees) of its axes,
-    and x_after, … of the axes behind it, each pose also as a Pose, before or after; numbers may be tensors that require
-    a gradient.
+    semi_diameter, chip_zone, mechanical_semi_diameter, apertures, comment; decentres x, y, z (mm) and tilts tilt_x,
+    tilt_y, tilt_z (degrees) of its axes, and x_after, … of the axes behind it, each pose also as a Pose, before or
+    after; numbers may be tensors that require a gradient.
     stop: number of the stop surface, counted from 1. One aperture by name, as f_number=3.5 or
     entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
