@@ -194,7 +194,7 @@ class LossDescents:
                 best, refined = self._descend(function, best.state.x, watch), refined + 1
                 evaluations += function.evaluations
         except KeyboardInterrupt:  # outside the cycles of a descent
-            self.stopped = "interrupted"
+            self.stopped, checked = "interrupted", np.nan
         report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), best.state.cost, checked, refined, first)
         return LossDescent(
             best.state.x, tuple(self.history), self.stopped or best.stopped, cycles_used + len(self.history),
