@@ -48,12 +48,11 @@ DIFFERENT = {
     "--log": "optimize writes one; elsewhere the scale of a figure",
     "--resume": "codesign finds its own runs",
     "--depth": "layers of a network, distances of points, and a map",
-    "--tolerance": "a height error of etching, and a switch for the lens as built",
+    "--tolerance": "a height error of etching, a switch for the lens as built, and in % of the figures of parts",
     "--sensor": "its distance from an element, and its size",
     "--efl": "edit scales to a number, stock finds parts within a range",
     "--elements": "draw has sheets of some, stock finds parts of a number of them",
     "--glass": "one of a phase element, several of a part",
-    "--tolerance": "in % of the figures of parts, in nm of the heights of an element",
     **dict.fromkeys(("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"),
 }
 
