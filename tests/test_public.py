@@ -364,7 +364,7 @@ NEEDED = {
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in ("compare-models", "psf") else ())
+        pytest.param(c, id=c.name, marks=pytest.mark.slow if c.name in ("compare-models", "psf", "report") else ())
         for c in OF_A_LENS
     ],
 )

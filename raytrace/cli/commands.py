@@ -408,8 +408,8 @@ on request: {", ".join(ON_REQUEST)}""",
         zoom.zmx --configuration 2 --field 0 5 10 -o tele.pdf
         double_gauss --range -20 60 --mount aluminium -o report.pdf""",
         "lens", row("configuration", "which one of a multi-configuration file, from 1 (default: all)"), *LENS[2:],
-        CONDITIONS, Option("output", report_file, "OUT", "report to write: .pdf, .html, .json", "-o --output",
-                                  required=True),
+        CONDITIONS, output("report to write (.pdf, .html, .json); without it the sections are listed",
+                                       report_file),
         "fields",
         group(
             "sections",
