@@ -8,12 +8,13 @@ element: kernels of a height map of 200 × 200 pixels without a lens at four obj
 all heights.
 """
 
+import argparse
 import dataclasses
 import statistics
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from second_order import c_mount
@@ -135,8 +136,24 @@ def element() -> None:
     print(f"{side} × {side} heights, {camera._sampling}: {1e3 * medians({'step': step})['step']:.0f} ms", flush=True)
 
 
-if __name__ == "__main__":
+PARTS = {"clipped": clipped, "built": built, "element": element}
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; by default all")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
+    parts = parser.parse_args(argv).parts or [*PARTS]
+    if unknown := [part for part in parts if part not in PARTS]:
+        parser.error(f"{unknown[0]!r} is not known; expected {', '.join(PARTS)}")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    for part in sys.argv[1:] or ("clipped", "built", "element"):
-        {"clipped": clipped, "built": built, "element": element}[part]()
+    for part in parts:
+        PARTS[part]()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -624,7 +624,7 @@ def _bounded(ray_map: RayMap, coarse: Fans, largest: Callable[[Tensor], Tensor])
         change = c.diff().abs().amax() + (torch.roll(c, -1, -2) - c).abs().amax()
         if not float(largest(change - c.amin())) < 0:
             kept.append(number)
-    crossings, apertures = (tuple(part[k] for k in kept) for part in (ray_map.crossings, ray_map.apertures))
+    crossings, apertures = tuple(ray_map.crossings[k] for k in kept), tuple(ray_map.apertures[k] for k in kept)
     return dataclasses.replace(ray_map, crossings=crossings, apertures=apertures)
 
 

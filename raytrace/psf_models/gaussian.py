@@ -459,6 +459,7 @@ def _merged(lights: list[Light], parts: Sequence[Tensor]) -> Tensor:
     merged = parts[0]
     for light, part in zip(lights[1:], parts[1:], strict=True):
         axis = part.dim() - 3
+        assert light.pairs is not None  # as `trace_light` makes them
         each = merged.flatten(axis, axis + 1).index_copy(axis, light.pairs, part.flatten(axis, axis + 1))
         merged = each.unflatten(axis, merged.shape[axis : axis + 2])
     return merged
