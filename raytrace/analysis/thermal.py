@@ -87,7 +87,7 @@ class Thermal(Analysis):
     @styled
     def draw(self) -> Figure:
         """Focus shift between the limits of a quarter wave, RMS spot radius and modulation over temperature."""
-        curves = []
+        curves: list[tuple[Tensor, str, float | None]] = []
         if self.rms is not None:
             curves.append((1e3 * self.rms, "RMS spot radius (µm)", None))
         if self.modulation is not None and self.frequency is not None:
@@ -161,21 +161,29 @@ def thermal(
         warnings.simplefilter("ignore", NoThermalCoefficients)
         nominal = focused.surfaces[-2].thickness - lens.surfaces[-2].thickness
         rows = [_row(lens.at(temperature=each), fields, frequency, nominal, "rms" in measures) for each in celsius]
-    columns = [None if column[0] is None else torch.stack(column) for column in zip(*rows, strict=True)]
-    if not bool(torch.isfinite(columns[3]).all()):
+    lengths = [torch.stack([row[0][n] for row in rows]) for n in range(4)]
+    rms, modulation = _stacked([row[1] for row in rows]), _stacked([row[2] for row in rows])
+    if not bool(torch.isfinite(lengths[3]).all()):
         raise NothingToShow("nothing to show over temperature: no ray reaches the image, or the lens has no focus")
     depth = 0.5e-3 * lens.primary / first_order(lens).image_na ** 2
     cycles = None if frequency is None else lens.wavelengths.new_tensor(frequency)
     expansion = lens.wavelengths.new_tensor(expansion_of(mount))
-    focal, back, sensor, shift, rms, modulation = columns
-    pairs = (None if pair is None else pair.T for pair in (rms, modulation))
-    return Thermal(lens, fields, celsius, focal, back, sensor, shift, *pairs, cycles, depth.reshape(()), expansion)
+    focal, back, sensor, shift = lengths
+    return Thermal(
+        lens, fields, celsius, focal, back, sensor, shift, rms, modulation, cycles, depth.reshape(()), expansion
+    )  # fmt: skip
+
+
+def _stacked(pairs: Sequence[Tensor | None]) -> Tensor | None:
+    """Pairs (2,) of every temperature as (2, T); None where they are not asked."""
+    asked = [pair for pair in pairs if pair is not None]
+    return torch.stack(asked, 1) if asked else None
 
 
 def _row(
     lens: Lens, fields: Tensor, frequency: float | None, nominal: Tensor, spots: bool
-) -> tuple[Tensor | None, ...]:
-    """The numbers of a `Thermal` at the temperature of a lens."""
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], Tensor | None, Tensor | None]:
+    """The lengths, RMS spot radii and modulations of a `Thermal` at the temperature of a lens."""
     data, sensor, refocused = first_order(lens), lens.surfaces[-2].thickness, _focused(lens, fields)
     rule, both, radii, lowest = gauss_rings(_RINGS, **like(lens)), (lens, refocused), None, None
     shift = refocused.surfaces[-2].thickness - sensor - nominal
@@ -186,7 +194,7 @@ def _row(
             cycles = lens.wavelengths.new_tensor([frequency])
             curves = [modulations(aligned(each, 3), fields, cycles) for each in both]
             lowest = torch.stack([torch.minimum(*pair).amin() for pair in curves])
-    return data.effective_focal_length, data.back_focal_distance, sensor, shift, radii, lowest
+    return (data.effective_focal_length, data.back_focal_distance, sensor, shift), radii, lowest
 
 
 def _scene(lens: Lens, fields: Tensor) -> dict[str, Any]:

@@ -132,10 +132,9 @@ def optimize(
             raise ValueError(f"{log}: {option('log')} and {option(name)} are one file; give them two")
     vary, spaces = without_spacers(lens, vary)
     if spaces:
-        given: dict[str, object] = {"log": log, "checkpoint": checkpoint, "resume": resume, "loss": loss}
-        given |= {"stock": stock, "test_plates": test_plates}
-        given |= {"merit": merit} if callable(merit) else {}
-        for name, setting in given.items():
+        function = merit if callable(merit) else None
+        others = ("log", log), ("checkpoint", checkpoint), ("resume", resume), ("loss", loss), ("merit", function)
+        for name, setting in (*others, ("stock", stock), ("test_plates", test_plates)):
             if setting is not None:
                 raise NoProblem(f"{option('vary', 'spacer')} goes without {option(name)}: leave one out")
         return _with_spacers(

@@ -155,7 +155,7 @@ def choose_spacers(
         combinations, predicted = _predicted(lens, groups, numbers, problem)
         order = np.argsort(predicted, kind="stable")
         now = _expansions(lens, groups)
-        tried = []
+        tried: list[tuple[np.ndarray, float, Any]] = []
         for index in order:
             choice = combinations[index]
             if now is not None and np.array_equal(numbers[choice], now):
@@ -187,10 +187,11 @@ def choose_spacers(
 
 def _expansions(lens: Lens, groups: Sequence[tuple[int, ...]]) -> np.ndarray | None:
     """The expansions of the groups; None where one has no material, or several."""
-    expansions = [[lens.surfaces[k].expansion for k in group] for group in groups]
-    if any(α is None or float(α) != float(group[0]) for group in expansions for α in group):
-        return None
-    return np.array([float(group[0]) for group in expansions])
+    stated = [[lens.surfaces[k].expansion for k in group] for group in groups]
+    sets = [{None if α is None else float(α) for α in group} for group in stated]
+    numbers = [next(iter(each)) for each in sets]
+    known = [number for number in numbers if number is not None]
+    return np.array(known) if len(known) == len(sets) and all(len(each) == 1 for each in sets) else None
 
 
 def _with(lens: Lens, groups: Sequence[tuple[int, ...]], expansions: np.ndarray) -> Lens:
