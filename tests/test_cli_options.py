@@ -493,7 +493,7 @@ def sentences(tree):
 
 
 def test_messages_name_options_by_a_function():
-    """`words.option("fields")` is --field in a command, and `fields` in Python."""
+    """`words.option("fields")` is --field in a command, and `fields` in Python; names of functions stay."""
     package, names = Path(rt.__file__).parent, {name for command in COMMANDS for name in rows(command)}
     others = ("cli/commands.py", "optimization/operands/", "imaging/camera.py", "io/__init__.py", "bench/")
     offenders = [
@@ -502,6 +502,6 @@ def test_messages_name_options_by_a_function():
         if not str(path.relative_to(package)).startswith(others)
         for text, line in sentences(parsed(path))
         for word in re.findall(r"`(\w+)(?:=[^`]*)?`", text)
-        if word in names
+        if word in names and word not in rt.PUBLIC
     ]
     assert not offenders, "\n".join(offenders)

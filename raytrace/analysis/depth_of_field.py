@@ -331,8 +331,8 @@ class _Measure:
         if self.criterion == "modulation":
             curves = mtf(lens, [self.frequency], fields=self.fields)
             return torch.minimum(curves.tangential, curves.sagittal)[:, 0]
-        found = rms_of_fields(lens, self.fields, self.criterion == "blur", "primary").polychromatic
-        return 2 * math.sqrt(2) * found if self.criterion == "blur" else found
+        rms = rms_of_fields(lens, self.fields, self.criterion == "blur", "primary").polychromatic
+        return 2 * math.sqrt(2) * rms if self.criterion == "blur" else rms
 
     def excess(self, vergence: Tensor | float) -> Tensor:
         """(F,) above 0 where it is not sharp, in units of the limit; without light 1."""
@@ -381,8 +381,8 @@ def _attached(
     if not any(map(varies, pytree.tree_leaves(lens))) or not math.isfinite(root) or root == 0:
         return u
     with torch.enable_grad():
-        at = u.detach().requires_grad_()
-        (slope,) = torch.autograd.grad(plain(at), at)
+        vergence = u.detach().requires_grad_()
+        (slope,) = torch.autograd.grad(plain(vergence), vergence)
     return u - function(u) / slope
 
 

@@ -81,14 +81,14 @@ class Intercepts(Analysis):
         """The largest numbers (K,) at every surface, and their places among fields, wavelengths and rays; -1: none."""
         each = {"height": safe_sqrt(dot_2(self.position, self.position)), "incidence": self.incidence}
         each["refraction"] = self.refraction
-        found = {name: torch.where(self.valid, values, -1.0).flatten(0, 2).max(0) for name, values in each.items()}
-        return {name: (largest, torch.where(largest < 0, -1, place)) for name, (largest, place) in found.items()}
+        maxima = {name: torch.where(self.valid, values, -1.0).flatten(0, 2).max(0) for name, values in each.items()}
+        return {name: (largest, torch.where(largest < 0, -1, place)) for name, (largest, place) in maxima.items()}
 
     def _rays_of_largest(self) -> dict[str, list[str]]:
         """Names of the rays of the largest numbers, by the name of their column."""
         return {
-            f"{name}_ray": [self.rays[int(at) % len(self.rays)] if at >= 0 else "-" for at in place]
-            for name, (_, place) in self._largest().items()
+            f"{name}_ray": [self.rays[int(place) % len(self.rays)] if place >= 0 else "-" for place in places]
+            for name, (_, places) in self._largest().items()
         }
 
     def column(self, name: str) -> Column:

@@ -64,9 +64,9 @@ class Vignetting(OverField):
     COMMAND = "vignetting"
 
     def columns(self) -> dict[str, Tensor]:
-        named = {f"surface_{k}_percent": cut for k, cut in zip(self.surfaces, self.cut.unbind(-1), strict=True)}
+        cuts = {f"surface_{k}_percent": cut for k, cut in zip(self.surfaces, self.cut.unbind(-1), strict=True)}
         others = {"factors_percent": self.of_factors, "unaimed_percent": self.unaimed}
-        shares = {"passed_percent": self.passed, **named}
+        shares = {"passed_percent": self.passed, **cuts}
         shares |= {name: share for name, share in others.items() if bool((share > _WHOLE).any())}
         return {**self.heads(), **{name: 100 * share for name, share in shares.items()}}
 
