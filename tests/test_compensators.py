@@ -14,11 +14,6 @@ from raytrace.tolerancing.study import with_changes
 GAP = 12.93  # behind surface 2 of the Cooke triplet, mm
 
 
-@pytest.fixture(scope="module")
-def cooke():
-    return rt.read_lens("cooke_triplet")
-
-
 @pytest.mark.parametrize(
     ("condition", "least", "most"),
     [
@@ -36,15 +31,15 @@ def cooke():
         ("CTLT(2,0,0,0,0,0)<=13", -math.inf, 13 - GAP),
     ],
 )
-def test_a_condition_on_the_gap_limits_the_compensator(cooke, condition, least, most):
-    lens = cooke.with_conditions(condition)
+def test_a_condition_on_the_gap_limits_the_compensator(condition, least, most):
+    lens = rt.read_lens("cooke_triplet").with_conditions(condition)
     ((found,), words) = within_conditions(lens, [Compensator(2)])
     assert (found.minimum, found.maximum) == (pytest.approx(least, abs=1e-9), pytest.approx(most, abs=1e-9))
     assert len(words) == int(math.isfinite(least) or math.isfinite(most))
 
 
-def test_the_narrower_limit_counts(cooke):
-    lens = cooke.with_conditions("air_thickness:2>=12.5 air_thickness:2<=13")
+def test_the_narrower_limit_counts():
+    lens = rt.read_lens("cooke_triplet").with_conditions("air_thickness:2>=12.5 air_thickness:2<=13")
     ((found,), words) = within_conditions(lens, [Compensator(2, minimum=-0.1, maximum=1.0)])
     assert (found.minimum, found.maximum) == (-0.1, pytest.approx(13 - GAP, abs=1e-9))
     assert len(words) == 1
@@ -54,9 +49,9 @@ def test_the_narrower_limit_counts(cooke):
     ("parameter", "surface", "condition"),
     [("thickness", 2, "air_edge:2>=10"), ("curvature", 1, "edge:1>=2"), ("curvature", 2, "air_edge:2>=10")],
 )
-def test_an_edge_is_at_its_limit_at_the_limit_of_the_compensator(cooke, parameter, surface, condition):
+def test_an_edge_is_at_its_limit_at_the_limit_of_the_compensator(parameter, surface, condition):
     """The condition of the lens there, as `info` lists it."""
-    lens = cooke.with_conditions(condition)
+    lens = rt.read_lens("cooke_triplet").with_conditions(condition)
     ((found,), words) = within_conditions(lens, [Compensator(surface, parameter)])
     ends = [end for end in (found.minimum, found.maximum) if math.isfinite(end)]
     assert len(words) == 1
@@ -81,8 +76,8 @@ def test_trials_keep_the_condition_of_the_adjusted_space():
     assert not free.conditions
 
 
-def test_co_design_without_the_conditions_of_the_lens(cooke, command):
-    lens = cooke.with_conditions("total_track<=120 edge>=0.5")
+def test_co_design_without_the_conditions_of_the_lens(command):
+    lens = rt.read_lens("cooke_triplet").with_conditions("total_track<=120 edge>=0.5")
     kept = rt.imaging.Variables(lens, "curvature:1-3").conditions
     assert kept == ("total_track<=120", "edge:1-7>=0.5") or len(kept) == 2
     assert rt.imaging.Variables(lens, "curvature:1-3", stored=False).conditions == ()
