@@ -1,9 +1,7 @@
 """Materials of spacers chosen by an optimisation over temperatures, against all combinations."""
 
-import dataclasses
 import itertools
 
-import numpy as np
 import pytest
 import torch
 
@@ -122,16 +120,17 @@ def test_materials_that_are_the_best_stay():
 
 @pytest.mark.slow
 def test_glasses_and_spacers_together(tmp_path):
-    """Not worse than with glasses, or spacers, alone; the file keeps the expansion."""
+    """A catalog glass and a listed material; with the material of the lens it is not better; the file keeps both."""
     lens = achromat().with_temperatures(WARM)
-    settings = dict(merit="spot", hold="efl@1=100", cycles=10, glasses="preferred", bounds="thickness:1..20")
-    spacers = rt.optimize(lens, vary="curvature sensor spacer", **settings)
-    both = rt.optimize(lens, vary="curvature sensor glass:1,3 spacer", **settings)
-    assert both.merit_after <= spacers.merit_after * 1.001
-    assert both.glasses
+    settings = dict(merit="spot", hold="efl@1=100", cycles=5, glasses="preferred price<=1.2")
+    words = "sensor curvature:4 glass:3"
+    both = rt.optimize(lens, vary=f"{words} barrel", mounts="aluminium invar", **settings)
+    glasses = rt.optimize(lens, vary=words, **settings)
+    assert both.merit_after <= glasses.merit_after * (1 + 1e-6)
+    assert any(step.surface == 3 for step in both.glasses)
+    assert float(both.lens.surfaces[2].expansion) == float(both.lens.surfaces[4].expansion) in (23.6, 1.3)
     both.save(tmp_path / "athermal.zmx")
     back = rt.read_lens(tmp_path / "athermal.zmx")
     for k in (2, 4):
         assert float(back.surfaces[k].expansion) == pytest.approx(float(both.lens.surfaces[k].expansion))
-    assert np.isfinite(both.merit_after)
-    assert dataclasses.is_dataclass(both.spacers[0]) if both.spacers else True
+    assert back.surfaces[3].glass.name == both.lens.surfaces[3].glass.name
