@@ -105,7 +105,7 @@ def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(
 
 
 #: Commands that trace no rays of a lens whose aiming may be chosen.
-WITHOUT = {"lenses", "check", "convert", "edit", "mcp", "glass", "glasses", "bench", "wave"}
+WITHOUT = {"lenses", "check", "convert", "edit", "mcp", "glass", "glasses", "bench", "stock", "wave"}
 
 
 @pytest.mark.parametrize("command", [command.name for command in COMMANDS])

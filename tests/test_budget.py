@@ -181,7 +181,7 @@ def test_commands_refuse_in_one_line(capsys):
     assert "1 GB may be taken" in line
 
 
-@pytest.mark.parametrize("name", [command for command in COMMANDS if command.name not in ("lenses", "mcp")])
+@pytest.mark.parametrize("name", [command for command in COMMANDS if command.name not in ("lenses", "mcp", "stock")])
 def test_every_command_that_computes_has_the_option(name, capsys):
     words = [name.name if hasattr(name, "name") else name]
     if words == ["wave"]:

@@ -16,7 +16,7 @@ COMMANDS = [
     "spot double_gauss",
     "focus double_gauss",
     "mtf double_gauss",
-    "compare double_gauss",
+    "compare-models double_gauss",
     "psf double_gauss",
     "glass N-BK7",
     "wave psf --element cubic --depth 500",
@@ -165,9 +165,13 @@ def test_info_prints_infinite_or_a_dash_where_a_quantity_is_undefined(run):
     text = run("info", singlet("plate", PLATE)).out
     assert "nan" not in text
     assert "-inf" not in text
-    for quantity in ("effective focal length", "F/#", "paraxial image distance"):
+    for quantity, word in (
+        ("effective focal length", "afocal"),
+        ("F/#", "infinite"),
+        ("paraxial image distance", "infinite"),
+    ):
         line = next(line for line in text.splitlines() if line.strip().startswith(quantity))
-        assert line.removeprefix(f"  {quantity}").split()[0] == "infinite"
+        assert line.removeprefix(f"  {quantity}").split()[0] == word
     touching = run("info", singlet("touching", ("DISZ INFINITY", "DISZ 0"))).out
     (line,) = (line for line in touching.splitlines() if line.strip().startswith("magnification"))
     lens = rt.read_lens("touching.zmx")

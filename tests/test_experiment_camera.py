@@ -28,11 +28,11 @@ def test_differences_are_paired_by_seed():
 
 
 def test_settings_of_the_studies_differ_in_the_model_alone(tmp_path):
-    one = study.Study("models", tmp_path, 1.0, dead_leaves(10, size=84, colour=True))
+    one = study.Study("models", tmp_path, 1.0, 6, ("phone",), dead_leaves(10, size=84, colour=True))
     first, second = (dataclasses.asdict(one.settings("phone", arm, 3)) for arm in ("gaussian", "drt"))
     assert {name for name in first if first[name] != second[name]} == {"model"}
+    assert one.settings("phone", "frozen", 3) == one.settings("phone", "gaussian", 3)
     apart = dataclasses.replace(one, kind="apart")
-    assert apart.lenses == ["cooke_triplet"]
     assert {apart.settings("cooke_triplet", arm, 0).model for arm in study.ARMS["apart"]} == {"gaussian"}
 
 
@@ -42,7 +42,7 @@ def test_a_little_study_is_trained_tested_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "BASE", dataclasses.replace(study.BASE, width=4, patch=24, size=15, batch=4))
     for name, number in (("REFINED", 2), ("BANK", 8), ("TESTED", 2), ("DISTANCES", 2)):
         monkeypatch.setattr(study, name, number)
-    one = study.Study("apart", tmp_path, 3.0, dead_leaves(10, size=48, colour=True))
+    one = study.Study("apart", tmp_path, 3.0, 0, ("cooke_triplet",), dead_leaves(10, size=48, colour=True))
     one.folder.mkdir(exist_ok=True)
     rows = [study.row_of(one, "cooke_triplet", arm, 0) for arm in study.ARMS["apart"]]
     for found in rows:

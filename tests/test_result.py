@@ -24,6 +24,7 @@ _WITHOUT_LENGTHS = {
     "GlassList",
     "ImportReport",
     "Jacobian",
+    "LensComparison",
     "MeritsOfBatch",
     "Report",
     "StockList",
@@ -232,6 +233,7 @@ def test_every_table_is_compared():
     assert callable(rt.jacobian)
     assert callable(rt.draw)
     assert callable(rt.glasses)
+    assert callable(rt.compare)
     assert callable(rt.report)
     assert callable(rt.stock_find)
     known = {type(computed(name)).__name__ for name in results() if name not in DEAR} | {*DEAR.values()}

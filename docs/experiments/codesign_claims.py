@@ -369,10 +369,14 @@ def blur_of(runs: Sequence[Outcome], f_number: float) -> Measurements:
     return Measurements(tuple(distances.tolist()), blur, {})
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of table.csv; claims.csv is written there")
     parser.add_argument("--f-number", metavar="N", type=float, required=True, help="aperture of the runs")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options(parser)
     arguments = parser.parse_args()
     runs = outcomes_of(arguments.folder / "table.csv")
     judged = claims(runs, [], blur_of(runs, arguments.f_number), pending=())

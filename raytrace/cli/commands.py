@@ -1201,8 +1201,7 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         """examples:
   raytrace stock index vendors/thorlabs
   raytrace stock find --efl 50 --diameter 25.4 --achromat
-  raytrace edit lens.zmx --insert-part 3 AC254-050-A reversed -o with_part.zmx
-  raytrace optimize lens.zmx --stock stock.sqlite --vary curvature thickness -o of_stock.zmx""",
+  raytrace stock find stock.sqlite --efl 95..105 --json""",
         (),
         subcommands=STOCK_COMMANDS,
     ),
