@@ -7,17 +7,19 @@ import math
 import problems
 import pytest
 import torch
-from problems import MICROMETRE, NANOMETRE, vector
+from problems import MICROMETRE, NANOMETRE, scalar, vector
 
 import raytrace as rt
+from raytrace.analysis import encircled
 from raytrace.analysis.mtf import cutoff, mtf_on_grid
+from raytrace.analysis.pupil_autocorrelation import ExitPupil
 from raytrace.analysis.setting import scene_of, wavelength_shares
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import safe_sqrt
-from raytrace.maths.sampling import gauss_rings
+from raytrace.maths.sampling import gauss_legendre, gauss_rings
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
@@ -323,6 +325,100 @@ def test_encircled_energy_of_a_uniform_disc():
     radii = edge * torch.linspace(0, 1.2, 25, dtype=torch.float64)
     found = rt.encircled_energy(lens, radii, geometric=True)
     assert (found.share[0] - (radii / edge).clamp(max=1.0) ** 2).abs().max() < 2e-3
+
+
+def test_energy_in_squares_and_slits_of_an_airy_disc():
+    """Slit: the modulation of a circular pupil in closed form. Square and rectangle: Airy's irradiance integrated."""
+    lens, radii = perfect(), vector(0.3, 0.61, 1.5, 4.0) * WAVELENGTH / numerical_aperture(perfect())
+    cutoff = 2 * numerical_aperture(lens) / WAVELENGTH
+    nodes, weights = (torch.from_numpy(part) for part in gauss_legendre(400))
+    s = 0.5 * (nodes + 1)
+    modulation = 2 / math.pi * (torch.acos(s) - s * torch.sqrt(1 - s * s))
+    slit = ((2 * radii[:, None] * torch.sinc(2 * radii[:, None] * s * cutoff)) * modulation * weights * cutoff).sum(-1)
+    for shape in "xy":
+        assert (rt.encircled_energy(lens, radii, shape=shape).share[0] - slit).abs().max() < 1e-3
+
+    def inside(a, b):
+        x, y = a * 0.5 * (nodes + 1), b * 0.5 * (nodes[:, None] + 1)
+        v = math.pi * cutoff * torch.hypot(x, y)
+        irradiance = (math.pi * cutoff**2 / 4) * (2 * torch.special.bessel_j1(v) / v) ** 2
+        return a * b * (irradiance * weights * weights[:, None]).sum()
+
+    square = torch.stack([inside(a, a) for a in radii])
+    assert (rt.encircled_energy(lens, radii, shape="square").share[0] - square).abs().max() < 1e-3
+    low = torch.stack([inside(a, 0.25 * a) for a in radii])
+    found = rt.encircled_energy(lens, radii, shape="rectangle", aspect=0.25)
+    assert (found.share[0] - low).abs().max() < 1e-3
+    assert found.document()["aspect"] == 0.25
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.7])
+def test_energy_of_a_gaussian_spot(offset):
+    """Squares and rectangles: products of error functions; circles about its centre: 1 - exp(-r²/2σ²)."""
+    sigma, size, step = 1.5, 96, 0.01  # mm, cells, 1/mm
+    nu = step * (torch.arange(size, dtype=torch.float64) - size / 2)
+    amplitude = torch.exp(-((2 * math.pi * sigma) ** 2) * (nu**2 + nu[:, None] ** 2)).to(torch.complex128)
+    amplitude, one = amplitude[None, None], torch.ones(1, 1, dtype=torch.float64)
+    centre = torch.zeros(2, 1, 1, dtype=torch.float64)
+    pupil = ExitPupil(
+        amplitude, (amplitude.abs() ** 2).sum((-2, -1)), step * torch.ones_like(centre), centre, centre, one
+    )
+    radii = vector(0.0, 0.5, 1.5, 3.0, 8.0)
+
+    def share(half, away):
+        return 0.5 * (torch.erf((half - away) / sigma / 2**0.5) + torch.erf((half + away) / sigma / 2**0.5))
+
+    for sides in ((1.0, 1.0), (1.0, 0.4), (1.0, math.inf), (math.inf, 1.0)):
+        expected = math.prod(
+            torch.ones_like(radii) if side == math.inf else share(side * radii, away)
+            for side, away in zip(sides, (offset, 0.0), strict=True)
+        )
+        found = encircled._of_wave(pupil, 0, vector(offset, 0.0), radii, sides)
+        assert torch.allclose(found, expected, rtol=0, atol=1e-8)  # the amplitude is cut off at 2e-9
+    if not offset:
+        found = encircled._of_wave(pupil, 0, vector(0.0, 0.0), radii, None)
+        assert torch.allclose(found, 1 - torch.exp(-0.5 * (radii / sigma) ** 2), rtol=0, atol=2e-4)
+
+
+def test_geometric_energy_of_a_uniform_disc_in_squares_and_slits():
+    """4 a²/πR² in a square within the disc; 2/π (asin t + t √(1 - t²)) in a slit."""
+    lens = perfect(0.5)
+    edge = float(image_rays(lens, vector(0.0, 1.0)[:, None]).position[1].abs())
+    t = vector(0.1, 0.4, 0.7)
+    square = rt.encircled_energy(lens, edge * t, shape="square", geometric=True).share[0]
+    assert (square - 4 * t**2 / math.pi).abs().max() < 3e-3
+    slit = rt.encircled_energy(lens, edge * t, shape="x", geometric=True).share[0]
+    assert (slit - 2 / math.pi * (torch.asin(t) + t * torch.sqrt(1 - t * t))).abs().max() < 3e-3
+    assert float(rt.encircled_energy(lens, [1.01 * edge], shape="y", geometric=True).share) == 1
+
+
+@pytest.mark.filterwarnings("ignore::raytrace.UnfilledStop")
+@pytest.mark.parametrize("shape", ["circle", "square", "x", "y"])
+def test_energy_of_diffraction_has_its_derivatives(shape):
+    """By the sensor distance and by the aperture, which scales the frequencies of the pupil, against differences."""
+    lens = rt.read_lens("cooke_triplet")
+
+    def share(distance, diameter):
+        bench = lens.at(sensor_distance=distance, entrance_pupil_diameter=diameter)
+        return rt.encircled_energy(bench, [0.004], shape=shape, fields=[8.0], wavelengths=[0.55]).share.sum()
+
+    at = [lens.surfaces[-2].thickness.detach().clone().requires_grad_(), scalar(6.0).requires_grad_()]
+    slopes = torch.autograd.grad(share(*at), at)
+    for k, (slope, step) in enumerate(zip(slopes, (2e-4, 2e-3), strict=True)):
+        ends = [[value.detach() + side * step * (j == k) for j, value in enumerate(at)] for side in (1, -1)]
+        more, less = (share(*end) for end in ends)
+        assert float(slope) == pytest.approx(float(more - less) / (2 * step), rel=1e-5, abs=1e-7)
+
+
+def test_wrong_shapes_are_refused():
+    for options, said in (
+        ({"shape": "hexagon"}, "'hexagon' is not known; expected one of circle, square, rectangle, x, y"),
+        ({"shape": "rectangle"}, "height over width of the rectangle, is missing"),
+        ({"shape": "rectangle", "aspect": -1}, "is -1; expected a number above 0"),
+        ({"shape": "square", "aspect": 2}, "leave it out for square"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            rt.encircled_energy(perfect(), [0.01], **options)
 
 
 # over the field

@@ -544,6 +544,13 @@ ANALYSES = (
         "mm",
     ),
     ("encircled_energy", {"radii": [0.01, 0.02], "geometric": True}, "--radius 0.01 0.02 --geometric", "share", "mm"),
+    (
+        "encircled_energy",
+        {"radii": [0.01], "shape": "rectangle", "aspect": 2},
+        "--half-width 0.01 --shape rectangle --aspect 2",
+        "share",
+        "half_width",
+    ),
 )
 
 
