@@ -5,7 +5,6 @@ Whole processes are stood in for, but for slow tests: each would start torch ane
 
 import json
 import math
-import re
 
 import pytest
 import torch
@@ -295,7 +294,7 @@ def test_tables_have_the_accuracy_of_every_speed(measured):
 def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     rows, ratios = measured
     about = {"processor": "one", "torch threads": 2}
-    others = {"bytes_per_ray": 64.0, "bytes_per_ray_rays": 99, "spot_process_ratio": 1.2, "two_process_gain": 1.9}
+    others = {"bytes_per_ray": 64.0, "bytes_per_ray_rays": 99, "spot_process_ratio": 1.2, "two_process_gain": 1.5}
     ratios = {dtype: numbers | others | {"asphere_newton_steps": 4} for dtype, numbers in ratios.items()}
     page = extended.lines(ratios, sizes=TINY, about=about, compiled="cc -O3", repeats=1)
     found = extended.Page(rows, page, {}, extended.speed_figure, ("speed.md", "speed"))
@@ -305,7 +304,12 @@ def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     assert page.endswith(f"{KEPT}\nwords\n")
     assert "bench_limit.cpp`, cc -O3" in page
     assert "of time of day; processor one" in page
-    assert len(re.findall(r"\| (yes|no) \|", page)) >= len(extended.TARGETS)
+    judged = [
+        extended.met(key, bound, at_most, dtype, values[key])
+        for key, _, bound, at_most in extended.TARGETS
+        for dtype, values in ratios.items()
+    ]
+    assert page.count(" (missed) |") == judged.count(False) > 0
     assert len((tmp_path / "speed.csv").read_text().splitlines()) == 1 + len(rows)
     figure = found.plot()
     assert [panel.get_title() for panel in figure.axes] == ["float32", "float64"]

@@ -263,13 +263,13 @@ index marked certain agrees to 1e-6; every first-order quantity to 1e-8 relative
 order {first:.0e}, rays {rays:.0e} mm. Every file: [corpus.csv](corpus.csv). The files are not part of
 this repository; the tests are skipped without them.
 
-Surface types that are read and written: {types}. Every other type, and a glass that is not shipped, is
+{types} and the types of the table are read and written. Every other type, and a glass that is not shipped, is
 refused by name, surface and line.
 
 ## Surface types
 
 Files with a surface beyond conics and even aspheres. An automatic semi-diameter is the largest height of
-a few rays at the rim, which OpticStudio traced and stored.
+a few rays at the rim, which OpticStudio traced and stored. A single number: all of them.
 
 {table}
 
@@ -284,19 +284,24 @@ def types_of(name: str) -> list[str]:
     return FILES[name]["special"] or ["surface tilts"]
 
 
+def part(count: int, total: int) -> str:
+    """`total` where all count."""
+    return str(total) if count == total else f"{count} of {total}"
+
+
 def by_type() -> str:
     lines = [
-        "| type | files: right · refused · wrong | semi-diameters reproduced | source of the convention |",
+        "| type | files right | semi-diameters reproduced | source of the convention |",
         "|---|---|---|---|",
     ]
     kinds = dict.fromkeys([*SETTLED, *itertools.chain(*map(types_of, FILES))])
     for kind in kinds:
         names = [name for name in FILES if kind in types_of(name)]
-        counts = [sum(compare(name).outcome == outcome for name in names) for outcome in (RIGHT, REFUSED, WRONG)]
+        right = part(sum(compare(name).outcome == RIGHT for name in names), len(names)) if names else "–"
         sizes = [reproduced(n) for n in names if FILES[n]["stored_semidiameters"]["matched"]]
-        matched = f"{sum(one[0] for one in sizes)} of {sum(one[1] for one in sizes)}" if sizes else ""
+        matched = part(sum(one[0] for one in sizes), sum(one[1] for one in sizes)) if sizes else ""
         called = types()[kind].name if kind in types() else "before and after any surface (SCBD)"
-        lines.append(f"| `{kind}` {called} | {' · '.join(map(str, counts))} | {matched} | {SETTLED[kind]} |")
+        lines.append(f"| `{kind}` {called} | {right} | {matched} | {SETTLED[kind]} |")
     return "\n".join(lines)
 
 
@@ -323,7 +328,7 @@ def document(rows: list[dict[str, str]]) -> str:
     refusals = [f"- `{r['file']}`: {r['details'].partition('; ')[0]}" for r in rows if r["outcome"] != RIGHT]
     return _PAGE.format(
         count=len(rows), right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
-        types=", ".join(f"`{kind}`" for kind in types()), table=by_type(),
+        types=", ".join(f"`{kind}`" for kind in types() if kind not in SETTLED), table=by_type(),
         refusals="\n".join(refusals) or "None.",
         **largest,
     )  # fmt: skip

@@ -64,8 +64,8 @@ def test_the_table_lists_choices_and_losses():
     for model in ("fourier", "gaussian", "drt"):
         rows += [{**row, "model": model} for row in rows[2:4]]
     line = aperture.table(rows).splitlines()[-1]
-    assert line.startswith("| L | D | B | F/4 | F/8 | F/8 | F/8 | F/8 |")
-    assert "| 3.01 ± 0.00 | 0 | 0 | 0 |" in line
+    assert line.startswith("| L | D | B | F/8 | ")
+    assert line.endswith(" | F/4, 3.01 ± 0.00 | F/8 | F/8 | F/8 |")
     assert aperture.counts(rows) == (
         "level with waves to 0.1 dB in paraxial 0, fourier 1, gaussian 1, drt 1 of 1 scenes; waves undecided in 0"
     )

@@ -82,4 +82,4 @@ def test_the_table_pairs_seeds():
     assert row["seeds"] == 2
     assert row["difference"] == pytest.approx([-20, -10])
     line = colours.table([row]).splitlines()[-1]
-    assert "| 3.000 | 2.000 | 1.700 | -15.0 ± 63.5 | 0.10 | 0.40 |" in line  # 12.706 · 7.07/√2
+    assert "| pictures | 2.000 | 1.700 | -15.0 ± 63.5 | 0.10 | 0.40 |" in line  # 12.706 · 7.07/√2

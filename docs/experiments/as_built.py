@@ -177,7 +177,7 @@ def rows_of_conditions(store: Store) -> Iterator[dict]:
 def table_of_conditions(rows: list[dict]) -> Iterator[str]:
     """A row for each condition: nominal spot and those of the trials of the usual lens, their changes by the term."""
     for usual, robust in zip(rows[::2], rows[1::2], strict=True):
-        columns = ("nominal", "root_mean_square", "mean", "below_90")
+        columns = ("nominal", "root_mean_square", "below_90")
         cells = [f"{usual[name]:.2f}, {100 * (robust[name] / usual[name] - 1):+.1f} %" for name in columns]
         condition = f"{usual['lens']}, F/{usual['f_number']:g}, {usual['field']:g}°"
         yield " | ".join([f"| {condition}", f"{usual['weight']:g}", *cells]).replace("-", "−") + " |"

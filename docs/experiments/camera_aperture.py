@@ -224,19 +224,19 @@ def seeds_of(row: dict) -> list[float]:
 
 
 def table(rows: list[dict]) -> str:
-    """The table of the page: the F/number that each model selects, and the PSNR that this costs."""
-    models = [*ORDERS]
-    heads = ["lens", "depth", "light", *models, "PSNR of wave's choice", *(f"{m}, loss" for m in models[:-1])]
+    """The table of the page: the F/number that each model selects, and the PSNR in dB that this costs."""
+    heads = ["lens", "depth", "light", "wave", "PSNR of wave's choice", *[*ORDERS][:-1]]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     for name, depth, light in dict.fromkeys((r["lens"], r["depth"], r["light"]) for r in rows):
         found = curves(rows, name, depth, light)
         chosen = {model: winner(curve) for model, curve in found.items()}
         judge = found["wave"]
         best = seeds_of(judge[chosen["wave"]])
-        words = [name, depth, light, *(f"F/{chosen[m]:g}" for m in models), f"{np.mean(best):.2f}"]
+        words = [name, depth, light, f"F/{chosen['wave']:g}", f"{np.mean(best):.2f}"]
         for model, lost in losses(found).items():
             middle, width = interval(lost)
-            words.append("0" if chosen[model] == chosen["wave"] else f"{middle:.2f} ± {width:.2f}")
+            cost = "" if chosen[model] == chosen["wave"] else f", {middle:.2f} ± {width:.2f}"
+            words.append(f"F/{chosen[model]:g}{cost}")
         lines.append("| " + " | ".join(words) + " |")
     return "\n".join(lines)
 

@@ -377,17 +377,17 @@ def comparisons(found: dict[tuple, dict], names: list[str]) -> list[dict]:
 
 
 def table(rows: list[dict]) -> str:
-    """The table of the page."""
+    """The table of the page, which quotes other spectra in a sentence."""
     lines = [
-        "| lens | fields | objects at | spectra | lens and filters apart, 10⁻⁴ | lens apart, joint filter | "
-        "lens and filter joint | difference of the joint lens, % | axial colour (modulus), mm: apart | joint |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| lens | fields | objects at | spectra | lens apart, joint filter, 10⁻⁴ | lens and filter joint | "
+        "difference of the joint lens, % | axial colour (modulus), mm: apart | joint |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         errors, colour = 1e4 * np.mean(row["errors"], 0), np.mean(np.abs(row["colour"]), 0)
         mean, width = interval(row["difference"])
         change = f"{mean:+.1f} ± {width:.1f}" if row["seeds"] > 1 else f"{mean:+.1f}"
-        words = [row["lens"], row["fields"], row["scene"], row["spectrum"], *(f"{error:.3f}" for error in errors)]
+        words = [row["lens"], row["fields"], row["scene"], row["spectrum"], *(f"{error:.3f}" for error in errors[1:])]
         words += [change, *(f"{one:.2f}" for one in colour)]
         lines.append("| " + " | ".join(words) + " |")
     return "\n".join(lines)

@@ -410,12 +410,11 @@ class Table(Result):
         return "\n".join(text)
 
     def markdown(self, content: str) -> str:
-        header = ("element", "Wiener, 1 m", "depth-invariant", "Wiener, mean of PSNRs")
-        header += ("worst depth", "spread", "light in window", "Sitzmann 2018")
+        header = ("element", "Wiener, 1 m", "depth-invariant", "spread", "light in window", "Sitzmann 2018")
         lines = []
-        for record, own, wiener, invariant, mean, _, printed in self.rows(content):
-            numbers = (record["worst_blind"], record["spread_blind"], min(min(row) for row in own.energy))
-            cells = (cell.removesuffix(" (+0.00)") for cell in (wiener, invariant, mean))
+        for record, own, wiener, invariant, *_, printed in self.rows(content):
+            numbers = (record["spread_blind"], min(min(row) for row in own.energy))
+            cells = (cell.removesuffix(" (+0.00)") for cell in (wiener, invariant))
             last = (f"{number:.2f}" for number in numbers)
             lines.append([ROWS[record["row"]].title, *cells, *last, printed or "–"])
         return grid(header, lines)
@@ -536,10 +535,9 @@ def _parts(
         f"{config.design / 1e3:g} m at 550 nm. Tested on {tested}, in closed form over noise; filters are "
         f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
         *(part for name in shown for part in (f"## {name[0].upper()}{name[1:]}", table.markdown(name))),
-        "PSNR in dB, mean over depths, of errors pooled over pictures; *mean of PSNRs*: of single "
-        "pictures. In brackets: gain over the Fresnel lens. Worst depth, and spread (best less worst depth): behind "
-        "the depth-invariant filter. Sitzmann 2018: published figures, other pictures. All contents: "
-        "[table.csv](wave/table.csv).",
+        "PSNR in dB, mean over depths, of errors pooled over pictures. In brackets: gain over the Fresnel lens. "
+        "Spread: best less worst depth, behind the depth-invariant filter. Sitzmann 2018: published figures, other "
+        "pictures. All contents, worst depth and mean of the PSNRs of single pictures: [table.csv](wave/table.csv).",
         *([heights_of(learned)] if learned else []),
         *(picture(f"wave/{name}", CAPTIONS[name]) for name in figures),
     ]

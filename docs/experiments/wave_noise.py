@@ -350,10 +350,12 @@ class OverNoise(Result):
                 found.setdefault(one.row, {})[one.noise] = one
         return found
 
-    def lines(self, content: str, filter: str, cell: Callable[[Score], str]) -> tuple[list[str], list[list[str]]]:
-        """Header and a line for each row, a column for each noise."""
+    def lines(
+        self, content: str, filter: str, cell: Callable[[Score], str], noises: Sequence[float] = ()
+    ) -> tuple[list[str], list[list[str]]]:
+        """Header and a line for each row, a column for each noise (default: all)."""
         found = self.of(content, filter)
-        noises = sorted({noise for row in found.values() for noise in row})
+        noises = noises or sorted({noise for row in found.values() for noise in row})
         lines = [
             [title_of(row), *(cell(own[noise]) if noise in own else "–" for noise in noises)]
             for row, own in found.items()
@@ -612,7 +614,7 @@ def _parts(found: OverNoise, elements: Mapping[str, Element], command: str) -> l
         picture("wave/noise.png", f"Gain on {shown}, errors pooled over pictures; bands: 95 % intervals over classes."),
         picture("wave/gain.png", f"Gain at noise {_noise_of(found):g}; bars: 95 % intervals over classes."),
         *_table(found, shown, "wiener"),
-        "The best depth-invariant filter, all contents, both means, PSNR and the range of the random starts: "
+        "All noises, contents and filters, both means, PSNR and the range of the random starts: "
         "[noise.csv](wave/noise.csv).",
         *_again(found, list(elements)),
     ]
@@ -641,7 +643,10 @@ def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
 def _table(found: OverNoise, content: str, filter: str) -> Iterable[str]:
     yield f"## {content[0].upper()}{content[1:]}, {TITLES[filter]}"
     yield "Gain over the Fresnel lens, dB, errors pooled over pictures:"
-    header, lines = found.lines(content, filter, lambda one: str(one.gains.pooled))
+    noises = sorted({one.noise for one in found.scores})
+    header, lines = found.lines(
+        content, filter, lambda one: str(one.gains.pooled), sorted({noises[0], _noise_of(found), noises[-1]})
+    )
     yield grid(header, [line for line in lines if line[0] != ROWS["fresnel"].title])
 
 

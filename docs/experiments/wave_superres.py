@@ -69,6 +69,7 @@ BORDER = 16  # dark pixels of a small scene at every side
 TILE, WIDE = 47, 145  # pixels of the window of a place, and of one over all places and their windows
 CELLS = 400  # of a plate, across the aperture
 NOISES = (0.0003, 0.001, 0.003, 0.01, 0.03)
+SECTORS = "sectors"  # plates that the tables of the page leave out and the CSV files list
 TERMS, SPREAD = 45, 0.03  # Noll's last polynomial; µm RMS of each in a random start
 _START = 23  # last number of the key of a random start
 
@@ -435,7 +436,7 @@ class Study:
                 return {"heights": learned_plate(setup, start, count, S, steps)[0].numbers.detach().numpy()}
 
             heights = torch.tensor(self.store.arrays(f"small-{count}-{setup.key}", learned)["heights"])
-            plates = {"sectors": plate(sectors(paths)), "phase of the sum": start}
+            plates = {SECTORS: plate(sectors(paths)), "phase of the sum": start}
             plates["learned"] = (start[0].with_numbers(heights), *start[1:])
             for name, elements in plates.items():
                 title = f"{count} places, {name}"
@@ -474,9 +475,12 @@ class Table(Result):
         for scene in ("full frame", "small"):
             alike = [block for block in blocks if block.scene == scene]
             for rows in zip(*(block.rows for block in alike), strict=True):
+                if rows[0].name.endswith(SECTORS):
+                    continue
                 cells = [scene, rows[0].name]
                 for row, block in zip(rows, alike, strict=True):
-                    cells += [f"{row.psnr:.2f}", str(row.gain(block.rows[1]))]
+                    base = block.rows[1]
+                    cells += [f"{row.psnr:.2f}", "0" if row is base else str(row.gain(base))]
                 lines.append(cells)
         return grid(header, lines)
 
@@ -562,7 +566,8 @@ def _command(arguments: argparse.Namespace, settings: Settings) -> str:
 def _parts(table: Table, study: Study, command: str, figures: dict) -> list[str]:
     settings, side = study.settings, SIDE - 2 * BORDER
     noises = table.noises
-    lines = [[f"{record['noise']:g}", *(f"{value:.2f}" for value in list(record.values())[1:])] for record in noises]
+    names = [name for name in noises[0] if not name.endswith(SECTORS)]
+    lines = [[f"{record['noise']:g}", *(f"{record[name]:.2f}" for name in names[1:])] for record in noises]
     caption = (
         "Restored images and kernels. Top: a scene that fills the sensor. Bottom: a small scene on a dark ground, "
         "imaged at several places and restored jointly. Kernels: logarithmic, four decades."
@@ -580,10 +585,10 @@ def _parts(table: Table, study: Study, command: str, figures: dict) -> list[str]
         *(picture(f"wave/{name}", caption) for name in figures),
         f"## Pixels × {settings.factor[0]}",
         table.markdown(settings.factor[0]),
-        "All pixels, gains over bicubic enlargement, closed forms and the bound of one image: "
+        "All pixels, plates of sectors, gains over bicubic enlargement, closed forms and the bound of one image: "
         "[superres.csv](wave/superres.csv).",
         f"## The small scene over noise, pixels × {settings.factor[0]}, {table.blocks[0].setup.colours}",
-        grid(list(noises[0]), lines),
+        grid(names, lines),
         "Elements and filters are made for each noise ([superres_noise.csv](wave/superres_noise.csv)).",
     ]
 
