@@ -140,7 +140,7 @@ class CrossSection(Result):
         for panel in grid.flat[len(labels) :] if flows else ():
             panel.axis("off")
         first = axes[0, 0]
-        figure.legend(*first.get_legend_handles_labels(), loc="outside right upper")
+        figure.legend(*first.get_legend_handles_labels(), loc="outside right center")
         name = ": ".join(filter(None, (self.lens.name, f"{psfs.model} PSF, cross-sections")))
         note = [f"abscissa: µm from the {self.at}; each curve relative to its maximum; numbers: FWHM along x × y, µm"]
         if flows:
