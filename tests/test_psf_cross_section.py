@@ -101,7 +101,7 @@ def test_the_command(tmp_path, capsys):
     assert {row["axis"] for row in rows} == {"x", "y"}
     assert main([*words, "--json", "--pixel", "0.01"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["at"] == "peak"
+    assert document["through"] == "peak"
     assert len(document["summary"]) == 6
     assert document["units"]["profile"] == "1/µm²"
     for wrong, said in (

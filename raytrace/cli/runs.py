@@ -149,13 +149,13 @@ def trace(arguments: argparse.Namespace) -> None:
 
 def psf(arguments: argparse.Namespace) -> Result:
     """The kernels, or with --cross-section their profiles, which are a table and have no brightness scale."""
-    at = vars(arguments).pop("cross_section")
-    refuse_suffix("-o", arguments.output, (".csv", ".json") if at else (".npz",))
-    if not at:
+    through = vars(arguments).pop("cross_section")
+    refuse_suffix("-o", arguments.output, (".csv", ".json") if through else (".npz",))
+    if not through:
         return result_of_lens(arguments, raytrace.psf)
     if vars(arguments).pop("plot_log"):
         raise CommandError("--log is the brightness of kernels; leave it out with --cross-section")
-    return result_of_lens(arguments, raytrace.psf).cross_section(at)
+    return result_of_lens(arguments, raytrace.psf).cross_section(through)
 
 
 def tolerance(arguments: argparse.Namespace) -> Result:

@@ -26,7 +26,7 @@ class CrossSection(Result):
     where no light arrives, beyond the shorter side of a window, and everywhere if the centroid is outside the window.
     profile_fwhm, line_spread_fwhm: (2, D, F) or (2, D, F, W) mm, full widths between the outermost points at half of
     the maximum, linearly interpolated; nan where half of the maximum is not reached on both sides within the window.
-    at: "peak" or "centroid"; pitch: (D, F) mm, width of a sample, over which the light is averaged; psf: the kernels.
+    through: "peak" or "centroid"; pitch: (D, F) mm, width of a sample, which averages the light; psf: the kernels.
     """
 
     psf: Psf
@@ -36,7 +36,7 @@ class CrossSection(Result):
     profile_fwhm: Tensor
     line_spread_fwhm: Tensor
     pitch: Tensor
-    at: str
+    through: str
 
     COLUMNS = (
         Column("object_distance", "mm", "g", "object"), Column("wavelength", "µm", "g", "λ"),
@@ -87,13 +87,13 @@ class CrossSection(Result):
             entry["axis"] = "xy"[int(entry["axis"])]
         units = {name: unit for name in (*self.columns(), *self.summary()) if (unit := self.column(name).unit)}
         pitch = [number(p) for p in self.pitch.flatten()]
-        about = {"model": self.psf.model, "at": self.at, "samples_mm": pitch, "units": units}
+        about = {"model": self.psf.model, "through": self.through, "samples_mm": pitch, "units": units}
         return {**about, "summary": rows(self.summary()), "results": results}
 
     def tables(self) -> list[Table]:
         low, high = (1e3 * float(end) for end in (self.pitch.min(), self.pitch.max()))
         width = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        title = f"cross-sections of the {self.psf.model} PSF through the {self.at}; samples of {width} µm"
+        title = f"cross-sections of the {self.psf.model} PSF through the {self.through}; samples of {width} µm"
         notes = []
         if bool(torch.isnan(self.profile_fwhm).any()):
             notes.append("-: half of the maximum is not reached on both sides within the window")
@@ -142,7 +142,9 @@ class CrossSection(Result):
         first = axes[0, 0]
         figure.legend(*first.get_legend_handles_labels(), loc="outside right center")
         name = ": ".join(filter(None, (self.lens.name, f"{psfs.model} PSF, cross-sections")))
-        note = [f"abscissa: µm from the {self.at}; each curve relative to its maximum; numbers: FWHM along x × y, µm"]
+        note = [
+            f"abscissa: µm from the {self.through}; each curve relative to its maximum; numbers: FWHM along x × y, µm"
+        ]
         if flows:
             text = distance_text(distances[0])
             note.append(text if text.startswith("object") else f"object at {text}")
@@ -152,7 +154,7 @@ class CrossSection(Result):
 _HEADS = ("object_distance", "field_x", "field_y", "wavelength")
 
 
-def cross_section(psfs: Psf, at: Literal["peak", "centroid"] = "peak") -> CrossSection:
+def cross_section(psfs: Psf, through: Literal["peak", "centroid"] = "peak") -> CrossSection:
     """Cross-sections of the kernels of a `Psf` through their peaks or centroids.
 
     Of pixels that were specified (pixel, size or grid of `psf`) and of independent rays the kernels themselves, with
@@ -160,8 +162,8 @@ def cross_section(psfs: Psf, at: Literal["peak", "centroid"] = "peak") -> CrossS
     derivatives. Through the centroid, a profile is interpolated linearly between two rows of samples. The peak is
     the centre of the brightest sample. Raises ValueError for another place.
     """
-    if at not in ("peak", "centroid"):
-        raise ValueError(f"at {at!r} is not known; expected peak or centroid")
+    if through not in ("peak", "centroid"):
+        raise ValueError(f"through {through!r} is not known; expected peak or centroid")
     light, batch = psfs.kernel, psfs.energy.shape
     centre = psfs.grid.centre.reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
     pitch = psfs.grid.pitch
@@ -176,7 +178,7 @@ def cross_section(psfs: Psf, at: Literal["peak", "centroid"] = "peak") -> CrossS
     size = light.shape[-1], light.shape[-2]  # along x, along y
     peak = torch.stack([bright % size[0], bright // size[0]]).to(light.dtype)
     counts = light.new_tensor(size).reshape(2, *[1] * len(batch))
-    place = peak if at == "peak" else (psfs.centroid - centre) / wide + 0.5 * (counts - 1)
+    place = peak if through == "peak" else (psfs.centroid - centre) / wide + 0.5 * (counts - 1)
     dark = (light.detach() <= 0).all(-1).all(-1)
     seen = (place.detach() >= 0) & (place.detach() <= counts - 1)  # nan, of no light, is not
     shown = ~dark & seen.all(0)
@@ -199,7 +201,7 @@ def cross_section(psfs: Psf, at: Literal["peak", "centroid"] = "peak") -> CrossS
             part.append(torch.nn.functional.pad(curve, (0, most - size[a]), value=torch.nan))
     position, profile, spread = (torch.stack(part) for part in parts)
     widths = [fwhm(position, curve) for curve in (profile, spread)]
-    return CrossSection(psfs, position, profile, spread, *widths, pitch, at)
+    return CrossSection(psfs, position, profile, spread, *widths, pitch, through)
 
 
 def fwhm(position: Tensor, curve: Tensor) -> Tensor:

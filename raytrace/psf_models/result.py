@@ -198,14 +198,14 @@ class Psf(Result):
 
         return psf_grid(self, **options)
 
-    def cross_section(self, at: Literal["peak", "centroid"] = "peak") -> "CrossSection":
+    def cross_section(self, through: Literal["peak", "centroid"] = "peak") -> "CrossSection":
         """Profiles through the peak or the centroid along x and y, line spreads and their widths, with a figure.
 
         See `psf_models.CrossSection`. Of specified pixels, with derivatives; otherwise of the light finely sampled.
         """
         from raytrace.psf_models.cross_section import cross_section
 
-        return cross_section(self, at)
+        return cross_section(self, through)
 
     COLUMNS = (
         Column("object_distance", "mm", "g", "object"), Column("wavelength", "µm", "g", "λ"),
