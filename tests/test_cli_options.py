@@ -368,7 +368,7 @@ PARTS = {
     "execution": (Execution,),
 }
 #: Options of the runner of one command.
-OF_ONE_RUN = {"render": {"png_bits", "raw"}}
+OF_ONE_RUN = {"render": {"png_bits", "raw"}, "psf": {"cross_section"}}
 
 VERBS = [command for command in (*COMMANDS, *WAVE_COMMANDS) if command.verb in rt.PUBLIC]
 

@@ -22,7 +22,7 @@ SHOWN_BY = {
         "optimization.conditions",
     ),
     "tracing.lens_report": ("optimization.attained",),
-    "psf_models.result": ("psf_models.figures",),
+    "psf_models.result": ("psf_models.figures", "psf_models.cross_section"),
     "optimization.optimized": ("optimization.optimized_figure",),
 }
 

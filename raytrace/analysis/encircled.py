@@ -137,8 +137,8 @@ def _sides(shape: str, aspect: float | None) -> Sides | None:
             raise ValueError(f"{option('aspect')} belongs to {option('shape', 'rectangle')}; leave it out for {shape}")
         return _SIDES.get(shape)
     if aspect is None or not 0 < aspect < math.inf:
-        found = "is missing" if aspect is None else f"is {aspect:g}"
-        raise ValueError(f"{option('aspect')}, height over width of the rectangle, {found}; expected a number above 0")
+        reason = "is missing" if aspect is None else f"is {aspect:g}"
+        raise ValueError(f"{option('aspect')}, height over width of the rectangle, {reason}; expected a number above 0")
     return 1.0, float(aspect)
 
 

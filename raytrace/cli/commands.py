@@ -647,6 +647,7 @@ on request: {", ".join(ON_REQUEST)}""",
         double_gauss --model gaussian --object-distance 10000 30000 --plot psf.png
         double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
         double_gauss --model drt --rays 256 --json
+        cooke_triplet --model wave --cross-section --plot sections.png -o sections.csv
         double_gauss --model drt --rays 1e8 --max-bytes 200MB -o psf.npz""",
         *LENS, conditions("one row of kernels each"),
         Option("rho", positive_finite, "R", "of the paraxial model: σ over the radius of the blur (default 0.5, the "
@@ -657,8 +658,12 @@ on request: {", ".join(ON_REQUEST)}""",
                 "number of them"),
         ),
         output("arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], "
-            "pixel_pitch, energy, error, wavelengths, model", file_of(".npz")),
+            "pixel_pitch, energy, error, wavelengths, model; with --cross-section its table (.csv) or document (.json)",
+            file_of(".npz", ".csv", ".json")),
         plot("the kernels, finely in windows that they fill (with --pixel or --size: the pixels),"), "plot_log",
+        Option("cross_section", help="profiles through the peak (without a word) or the centroid along x and y, line "
+            "spreads (integrated across), and their full widths at half maximum, instead of the kernels",
+            nargs="?", const="peak", choices=("peak", "centroid")),
         "model", "fields", "wavelength_weights", "pixel",
         row("size", "pixels across the window of the PSF (default 21)"),
         Option("center", help="centre of the window: the chief ray (default), the optical axis or the centroid of the "
@@ -666,6 +671,7 @@ on request: {", ".join(ON_REQUEST)}""",
         Option("normalise", help="energy (1 = all light through the entrance pupil) or window (each kernel sums to 1)",
             choices=("energy", "window"), default="energy"),
         switch("per_wavelength", "a kernel for each wavelength instead of their weighted sum"),
+        run="cli.runs:psf",
     ),
     _command(
         "render",
@@ -1121,13 +1127,20 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
     _command(
         "encircled-energy",
         "encircled energy",
-        "Fraction of the light within a radius about the centroid of the rays, by diffraction or geometrically.",
+        "Fraction of the light within a radius about the centroid of the rays, by diffraction or geometrically; or "
+        "within a square (ensquared energy), a rectangle or a slit.",
         """
         tessar --plot encircled.png
-        double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
+        double_gauss --geometric --radius 0.005 0.01 0.02 --json
+        double_gauss --shape square --half-width 0.0025 0.005
+        double_gauss --shape x --plot slit.png""",
         *LENS, CONDITIONS, plot("the curves"), TABLE,
         Option("radii", positive_finite, "MM", "about the centroid of the rays, mm, by default from 0 to almost all of "
-            "the light", flag="--radius", nargs="+"),
+            "the light; of other shapes than the circle, half-widths", flag="--radius --half-width", nargs="+"),
+        Option("shape", help="circle (default), square, rectangle, or a slit: x or y, within the half-width along that "
+            "axis, unlimited along the other", choices=("circle", "square", "rectangle", "x", "y"), default="circle"),
+        Option("aspect", positive_finite, "A", "height over width of the rectangle: half-widths a along x and A·a "
+            "along y"),
         switch("geometric", "of rays alone, without diffraction"), "fields",
     ),
     _command(

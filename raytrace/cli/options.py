@@ -39,7 +39,7 @@ class Option:
 
     name: the parameter; reader: of the text of a value; flag: by default --name, two with a space between them, or
     the name itself for a positional argument; default: the parameter's, which completes the help text, or None
-    where the function has its own; nargs, choices, action, required: as for `argparse`.
+    where the function has its own; nargs, const, choices, action, required: as for `argparse`.
     """
 
     name: str
@@ -48,6 +48,7 @@ class Option:
     help: str = ""
     flag: str = ""
     nargs: str | int | None = None
+    const: Any = None
     choices: Sequence[object] | None = None
     action: str | type[argparse.Action] | None = None
     default: object = None
@@ -58,7 +59,9 @@ class Option:
         flags = self.flag.split() or [f"--{self.name.replace('_', '-')}"]
         dest = self.name if flags[0].startswith("-") else None
         text = self.help if self.action else with_default(self.help, self.default)
-        settings = {name: getattr(self, name) for name in ("metavar", "nargs", "choices", "action", "required")}
+        settings = {
+            name: getattr(self, name) for name in ("metavar", "nargs", "const", "choices", "action", "required")
+        }
         settings |= {"dest": dest, "type": self.reader, "help": text.replace("%", "%%")}
         given = {name: value for name, value in settings.items() if value is not None}
         parser.add_argument(*flags, default=self.default, **given)

@@ -15,6 +15,7 @@ from raytrace.cli.runner import (
     options_of,
     print_json,
     printed_on_failure,
+    refuse_suffix,
     result_of_lens,
     say,
 )
@@ -144,6 +145,17 @@ def trace(arguments: argparse.Namespace) -> None:
             listing.write(sys.stdout.write, lines.update)
     for line in listing.failures():
         say(line)
+
+
+def psf(arguments: argparse.Namespace) -> Result:
+    """The kernels, or with --cross-section their profiles, which are a table and have no brightness scale."""
+    through = vars(arguments).pop("cross_section")
+    refuse_suffix("-o", arguments.output, (".csv", ".json") if through else (".npz",))
+    if not through:
+        return result_of_lens(arguments, raytrace.psf)
+    if vars(arguments).pop("plot_log"):
+        raise CommandError("--log is the brightness of kernels; leave it out with --cross-section")
+    return result_of_lens(arguments, raytrace.psf).cross_section(through)
 
 
 def tolerance(arguments: argparse.Namespace) -> Result:

@@ -14,6 +14,7 @@
 | radial          | rotationally symmetric light along one radius                                                |
 | dft             | sums of waves: matrix DFT, Bessel functions, Huygens                                         |
 | direct_sum      | the direct Huygens sum: converged kernels of waves, reference of the wave model              |
+| cross_section   | profiles of PSFs through peak or centroid, line spreads, their widths                         |
 | figures         | figures of PSFs, the finely sampled light in them                                            |
 
 To add a model: a module with `kernels(scene, grid, *, order) -> Kernels`, a class of its numbers and a row of `_ROWS`
@@ -24,6 +25,7 @@ test_psf_derivatives, test_psf_rays (independent rays), test_direct_sum, test_sh
 """
 
 from raytrace import namespace
+from raytrace.psf_models.cross_section import CrossSection as CrossSection
 from raytrace.psf_models.figures import CloseUp as CloseUp
 from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import MODELS as MODELS

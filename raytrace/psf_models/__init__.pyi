@@ -1,3 +1,4 @@
+from raytrace.psf_models.cross_section import CrossSection as CrossSection
 from raytrace.psf_models.figures import CloseUp as CloseUp
 from raytrace.psf_models.figures import close_up_of as close_up_of
 from raytrace.psf_models.models import MODELS as MODELS

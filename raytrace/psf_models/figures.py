@@ -138,15 +138,10 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     if close_up is None and not psfs.framed and psfs.order is not None:
         close_up = close_up_of(psfs)
     distances = psfs.object_distances.tolist()
-    if psfs.fields.dim() == 2:
-        labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
-    else:  # others for each object distance
-        labels = [f"field {number + 1}" for number in range(psfs.fields.shape[-1])]
+    labels = row_labels(psfs)
     line = _LINE if psfs.wavelengths_summed or len(psfs.wavelengths) > 2 * _LINE else len(psfs.wavelengths)
-    if not psfs.wavelengths_summed:
-        labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in psfs.wavelengths.tolist()]
     title = ": ".join(filter(None, (psfs.lens.name, f"{psfs.model} PSF")))
-    energy, kernels = _rows(array(psfs.energy), 0), _rows(array(psfs.kernel), 2)
+    energy, kernels = rows_of(array(psfs.energy), 0), rows_of(array(psfs.kernel), 2)
     notes = [
         [f"energy {e:.3f}, max {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
         for row in zip(energy, kernels, strict=True)
@@ -156,7 +151,7 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     if close_up is None:
         figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log, line)
         return worded(figure, title, [f"{window(psfs.grid)}; max: light of the brightest pixel", brightness(log)])
-    light, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
+    light, each = rows_of(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
     figure, axes = panels(light, halves, distances, labels, notes, log, line)
     centre = array(psfs.grid.centre).reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
@@ -169,7 +164,18 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     return worded(figure, title, [note, brightness(log)])
 
 
-def _rows(values: np.ndarray, kept: int) -> np.ndarray:
+def row_labels(psfs: Psf) -> list[str]:
+    """The field of each row of panels, and its wavelength where each has its kernel."""
+    if psfs.fields.dim() == 2:
+        labels = [field_label(psfs.lens, field) for field in array(psfs.fields).T]
+    else:  # others for each object distance
+        labels = [f"field {number + 1}" for number in range(psfs.fields.shape[-1])]
+    if psfs.wavelengths_summed:
+        return labels
+    return [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in psfs.wavelengths.tolist()]
+
+
+def rows_of(values: np.ndarray, kept: int) -> np.ndarray:
     """(D, F, …) or (D, F, W, …), `kept` axes last, as (F or F·W, D, …)."""
     values = np.moveaxis(values, 0, values.ndim - kept - 1)
     return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
@@ -213,9 +219,9 @@ def panels(
         if flows:
             panel.set_title(labels[row].replace("\n", ", "), color=INK)
         elif row == 0:
-            panel.set_title(_distance(distances[column]), color=INK)
+            panel.set_title(distance_text(distances[column]), color=INK)
         if column == 0:
-            panel.set_ylabel((_distance(distances[0]) if row % line == 0 else "") if flows else labels[row])
+            panel.set_ylabel((distance_text(distances[0]) if row % line == 0 else "") if flows else labels[row])
     for panel in grid.flat[rows:] if flows else ():
         panel.axis("off")
     return figure, axes
@@ -256,7 +262,7 @@ def window(grid: Grid) -> str:
     return f"window of {pitch * grid.columns:.3g} µm, {grid.columns} × {grid.rows} pixels of {pitch:.3g} µm"
 
 
-def _distance(millimetres: float) -> str:
+def distance_text(millimetres: float) -> str:
     if math.isinf(millimetres):
         return "object at ∞"
     return f"{millimetres / 1000:g} m" if millimetres >= 1000 else f"{millimetres:g} mm"

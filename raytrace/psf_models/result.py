@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from raytrace.plotting.style import Figure
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.words import RaytraceError
+
+if TYPE_CHECKING:
+    from raytrace.psf_models.cross_section import CrossSection
 
 #: Number of axes before those of the batch, (D, F) or (D, F, W), in the tensors of Kernels and of a Psf.
 _BEFORE = {"kernel": 0, "energy": 0, "error": 0, "residual": 0, "arrived": 0}
@@ -194,6 +197,15 @@ class Psf(Result):
         from raytrace.psf_models.figures import psf_grid
 
         return psf_grid(self, **options)
+
+    def cross_section(self, through: Literal["peak", "centroid"] = "peak") -> "CrossSection":
+        """Profiles through the peak or the centroid along x and y, line spreads and their widths, with a figure.
+
+        See `psf_models.CrossSection`. Of specified pixels, with derivatives; otherwise of the light finely sampled.
+        """
+        from raytrace.psf_models.cross_section import cross_section
+
+        return cross_section(self, through)
 
     COLUMNS = (
         Column("object_distance", "mm", "g", "object"), Column("wavelength", "µm", "g", "λ"),
