@@ -132,3 +132,11 @@ def test_the_command_prints_and_draws(capsys, tmp_path):
     assert document["far_is_infinite"] == [True]
     assert document["results"][0]["far"] is None
     assert 0 < document["results"][0]["near"] < 1e6
+
+
+def test_a_lens_out_of_focus_is_reported_with_the_way_to_focus_it():
+    text = str(rt.depth_of_field(thin(3000.0).at(object_distance=1000.0), blur=0.02))
+    assert "object distance      1000 mm" in text
+    assert "object in focus" not in text
+    assert "not sharp with the sensor where it is" in text
+    assert "not sharp" not in str(rt.depth_of_field(thin(3000.0), blur=0.02))

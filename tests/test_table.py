@@ -7,7 +7,7 @@ import sys
 import pandas as pd
 import pytest
 
-from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
+from raytrace.io import FORMATS, LensFileError, UnsupportedSurface, write_lens
 from raytrace.io.frames import lens_from_frame, to_frame
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import MIRROR, mil_glass
@@ -348,3 +348,15 @@ def test_frame_of_a_designer():
 def test_reading_a_table_loads_no_pandas():
     code = "import sys, raytrace.io; sys.exit('pandas' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".zmx"])
+def test_a_written_file_states_the_catalog_of_an_ambiguous_glass(suffix, tmp_path):
+    """F5 of SCHOTT and of HOYA differ: a file that is read without its catalog warns, the written one does not."""
+    found, report = read(SYSTEM.replace("# catalogs: SCHOTT\n", "") + SINGLET.replace("N-BK7", "F5"))
+    assert "F5 is taken from SCHOTT" in " ".join(report.warnings)
+    path = tmp_path / f"written{suffix}"
+    write_lens(found, path)
+    again, report = FORMATS[suffix].read(path.read_bytes().decode(), str(path))
+    assert again.catalogs == ("SCHOTT",)
+    assert not report.warnings

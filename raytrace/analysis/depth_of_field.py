@@ -110,15 +110,22 @@ class DepthOfField(Analysis):
         def words(distance: Tensor) -> str:
             return "-" if math.isnan(distance) else object_text(float(distance))
 
+        blurred = torch.isnan(self.near)
+        at = "object distance    " if bool(blurred.all()) else "object in focus at "
         title = [
             f"sharp to {self.limit_text()}",
-            f"  object in focus at   {words(self.lens.surfaces[0].thickness)}, measured to surface 1",
+            f"  {at}  {words(self.lens.surfaces[0].thickness)}, measured to surface 1",
             f"  paraxial limits      {words(self.paraxial_near)} to {words(self.paraxial_far)}",
             f"  hyperfocal distance  {words(self.hyperfocal)}, near limit {words(self.hyperfocal_near)}; paraxial "
             f"{words(self.paraxial_hyperfocal)}, {words(self.paraxial_hyperfocal_near)}",
             f"  depth of focus       ±{1e3 * float(self.depth_of_focus):.6g} µm at the sensor, paraxial",
-            "",
         ]
+        if bool(blurred.any()):
+            title += [
+                "  -: not sharp with the sensor where it is; paraxial limits assume a sensor in paraxial focus.",
+                "     Focus the lens at this object distance (raytrace focus), or give another limit.",
+            ]
+        title.append("")
         return [Table(self.columns(), title)]
 
     @styled

@@ -202,7 +202,7 @@ def is_listed(glass: Glass) -> bool:
 
 
 def catalogs_needed(lens: Lens, user: Sequence[Path], file: str) -> tuple[str, ...]:
-    """The lens's catalogs, with further catalogs that its glasses need.
+    """The lens's catalogs, with further catalogs that its glasses need, also to be found without ambiguity.
 
     Raises LensFileError for a glass whose name is not found, or has other coefficients.
     """
@@ -221,14 +221,16 @@ def catalogs_needed(lens: Lens, user: Sequence[Path], file: str) -> tuple[str, .
 
 
 def _finds(glass: Glass, names: tuple[str, ...], user: Sequence[Path], place: Place) -> bool:
-    """True if the name finds the same coefficients, or belongs to a catalog that is unavailable."""
+    """True if the name finds the same coefficients in one catalog alone, or belongs to one that is unavailable."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AmbiguousGlass)
+            warnings.simplefilter("error", AmbiguousGlass)
             catalogs = catalogs_of_lens(names, user, Draft(place.file, ""))
             listed = find_glass(glass.name, catalogs=catalogs, user=tuple(user), where=str(place))
     except UnknownGlass:
         return bool(glass.catalog)
+    except AmbiguousGlass:
+        return not glass.catalog
     return same_figures(listed, glass)
 
 
