@@ -8,11 +8,12 @@ from pathlib import Path
 
 import matplotlib
 import pytest
+from matplotlib.lines import Line2D
 
 import raytrace as rt
-from raytrace.plotting.style import text_width
+from raytrace.plotting.style import new_figure, text_width
 from raytrace.settings import ON_REQUEST, SECTIONS
-from raytrace.workshop.document import Document, Heading, Picture, Section, rows_grid
+from raytrace.workshop.document import Document, Heading, Picture, Section, rows_grid, settled
 from raytrace.workshop.pages import _FOOT, ROOM, TALL, _paginated, pdf
 from raytrace.workshop.report import KINDS_OF_SECTIONS, BadReport
 from raytrace.workshop.web import page
@@ -252,6 +253,14 @@ def test_conditions_and_the_lens_as_built_are_listed():
     assert built["mean"] == expected["mean"]
 
 
+def test_conditions_of_a_lens_with_a_merit_function_are_listed_once():
+    lens = rt.read_lens("cooke_triplet").with_conditions("total_track<=90")
+    lens = rt.optimize(lens, merit="spot", vary="curvature", hold=None, cycles=0).lens
+    sections = rt.report(lens, only=["conditions"], date=DATE).content.sections
+    assert len(sections) == 1
+    assert str(sections[0].blocks).count("total_track") == 1
+
+
 def test_sections_are_chosen_and_counted():
     assert set(KINDS_OF_SECTIONS) == set(SECTIONS)
     assert set(ON_REQUEST) < set(SECTIONS)
@@ -275,6 +284,15 @@ def test_warnings_are_notes_once():
     notes = [b for s in report.content.sections for b in s.blocks if isinstance(b, str) and b.startswith("Note: ")]
     assert notes
     assert len(notes) == len(set(notes))
+
+
+def test_lines_of_a_figure_wider_than_the_page_reach_its_end():
+    figure = new_figure(15, 4)
+    figure.add_artist(Line2D([0.1, 0.9], [0.5, 0.5]))
+    content = pdf(Document("Title", (), (Section("a", "A", (Picture(settled(figure), "wide"),)),)))
+    streams = re.findall(rb"stream\r?\n(.*?)\r?\nendstream", content, flags=re.DOTALL)
+    drawn = b"".join(zlib.decompress(stream) for stream in streams if stream.startswith(b"x"))
+    assert re.search(rb"108 144 m\n972 144 l", drawn)
 
 
 def test_long_tables_have_their_head_on_every_page():

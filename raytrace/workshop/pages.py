@@ -364,7 +364,8 @@ def _inset(page: style.Figure, drawn: style.Figure, x: float, top: float, scale:
 
     class Inset(Artist):
         def draw(self, renderer: Any) -> None:
-            height = 72 * drawn.get_size_inches()[1]
+            size, page_size = drawn.get_size_inches(), (renderer.file.width, renderer.file.height)
+            height = 72 * size[1]
             before, canvas = drawn.dpi, drawn.canvas
             for part in drawn.findobj(Artist.get_rasterized):
                 part.set_rasterized(False)  # the page would place the pixels without the scale
@@ -375,7 +376,9 @@ def _inset(page: style.Figure, drawn: style.Figure, x: float, top: float, scale:
             renderer.file.output(*renderer.gc.finalize())
             state = copy.copy(renderer.gc)
             renderer.file.output(Op.gsave, scale, 0, 0, scale, x, top - scale * height, Op.concat_matrix)
+            renderer.file.width, renderer.file.height = map(float, size)  # lines are cut there, in units of the figure
             drawn.draw(renderer)
+            renderer.file.width, renderer.file.height = page_size
             renderer.file.output(*renderer.gc.finalize())
             renderer.file.output(Op.grestore)
             renderer.gc.copy_properties(state)

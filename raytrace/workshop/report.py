@@ -271,7 +271,7 @@ def _conditions(request: _Request, writer: _Writer) -> None:
     data = lens.optimization_data
     if data is not None and any(row.weight > 0 for row in data.merit):
         writer.blocks.append(Heading("Merit function"))
-        writer.analysis("Merit function", lambda: evaluate(lens))
+        writer.analysis("Merit function", lambda: dataclasses.replace(evaluate(lens), conditions=()))  # listed above
     if not writer.blocks and not writer.gaps:
         writer.gaps.append(
             "The lens stores no conditions and no merit function; `raytrace optimize --hold` adds conditions."
