@@ -93,3 +93,9 @@ def test_the_largest_numbers_are_those_of_the_table(tmp_path):
 def test_an_unknown_ray_is_refused():
     with pytest.raises(ValueError, match=r"chef.*expected chief, upper, lower, right, left"):
         rt.intercepts(one_sphere(), rays="chef")
+
+
+def test_the_text_states_the_wavelengths_of_the_largest_numbers():
+    lens = rt.read_lens("cooke_triplet")
+    assert f"largest numbers of all fields and rays, at {lens.primary:g} µm" in str(rt.intercepts(lens))
+    assert "at 0.4861, 0.6563 µm" in str(rt.intercepts(lens, wavelengths=[0.4861, 0.6563]))

@@ -1079,9 +1079,9 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         "intercepts",
         "named rays at every surface, and their largest heights and angles",
         "Where the chief ray and the rays on the rim of the beam of each field meet every surface: the largest height "
-        "and angles of incidence and refraction at each surface over all fields, wavelengths and rays, with the field "
-        "and the ray; --each, --json and -o also list every ray: point, direction cosines behind the surface and "
-        "angles, in the axes of each surface.",
+        "and angles of incidence and refraction at each surface over all fields and rays, at the primary wavelength or "
+        "those of --wavelength, with the field and the ray; --each, --json and -o also list every ray: point, "
+        "direction cosines behind the surface and angles, in the axes of each surface.",
         """
         double_gauss --plot angles.png
         phone --field 0 20 37 --wavelength 0.4861 0.6563 -o rays.csv
