@@ -171,3 +171,18 @@ def test_only_what_is_asked_is_computed(shown, tmp_path):
     torch.testing.assert_close(contrast.modulation, shown.modulation, rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match=r"`measure` 'spots': expected focus, rms, mtf"):
         rt.thermal(simple(), measure="spots")
+
+
+def test_the_semi_diameters_at_temperatures_are_those_of_the_rays_and_not_of_an_earlier_design():
+    lens = air_spaced()
+    lens = lens.with_semi_diameters(fixed=())
+    earlier = dataclasses.replace(
+        lens,
+        surfaces=tuple(
+            s if s.semi_diameter is None else dataclasses.replace(s, semi_diameter=2 * s.semi_diameter)
+            for s in lens.surfaces
+        ),
+    )
+    warm = earlier.with_temperatures([-20, 60], mount="aluminium")
+    for surface, expected in zip(warm.surfaces[1:-1], lens.surfaces[1:-1], strict=True):
+        assert float(surface.semi_diameter) == pytest.approx(float(expected.semi_diameter), rel=1e-9)

@@ -551,6 +551,7 @@ class Lens:
             dataclasses.replace(s, semi_diameter=sizes.get(k, s.semi_diameter)) for k, s in enumerate(lens.surfaces)
         )
         lens = dataclasses.replace(lens, surfaces=surfaces)
+        lens = lens.with_semi_diameters()  # stored automatic ones may be those of another design
         return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
 
     def with_semi_diameters(
