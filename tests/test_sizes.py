@@ -254,3 +254,11 @@ def test_the_command_sizes_a_lens_and_prints_both(run, tmp_path):
     assert surfaces[3]["mechanical_semi_diameter"] == pytest.approx(third, rel=1e-12)
     failed = run("edit", "cooke_triplet", "--semi-diameters", "margin=a", "-o", path)
     assert "--semi-diameters margin=a: expected per cent and mm, as 2,0.5" in failed.error
+
+
+def test_automatic_semi_diameters_of_an_optimised_lens_follow_its_rays():
+    lens = rt.read_lens("cooke_triplet").with_semi_diameters(fixed=())
+    optimised = rt.optimize(lens, vary="curvature:1-4", merit="spot", cycles=3).lens
+    sizes = [surface.semi_diameter for surface in optimised.surfaces[1:]]
+    assert sizes == pytest.approx([float(size) for size in semi_diameters(optimised)[1:]], rel=1e-6)
+    assert max(abs(one - surface.semi_diameter) for one, surface in zip(sizes, lens.surfaces[1:], strict=True)) > 0.01

@@ -219,7 +219,7 @@ def optimize(
         """The result at variables x (n,), with its warnings; more: further fields."""
         results = _attained(problem, after, x, lower=lower, upper=upper)
         seconds = time.monotonic() - started
-        end, model = lens_at(x), problem.model
+        end, model = lens_at(x).with_semi_diameters(), problem.model  # the automatic ones follow the rays
         return _warned(_optimized(lens, end, model, x, history, conditions=results, seconds=seconds, **more))
 
     if conditions:
