@@ -6,7 +6,7 @@
 
 `models`: step 1 of the first work with Gaussian and with DRT PSFs, and with the lens of the file frozen, in `--steps`
 steps each; all curvatures and air spaces of each of `--lenses`. `apart`: the lens of the file, one of least spots and
-one of the closed form (DRT PSFs, by `lm`, from the least spots), each with a network trained behind it and with both
+one of the closed form (by `lm`, from the least spots), each with a network trained behind it and with both
 trained further, against training of both from the start. Every training of `apart` has `--seconds` of processor time,
 lens and network together: its number of steps follows from the measured time of a step. Step 2 freezes the lens and
 trains the network further with DRT PSFs; the test takes held-out photographs at the middle, at 0.7 and at the corner of
@@ -82,7 +82,7 @@ SEEDS = range(5)
 SHOWN = 9e3  # mm, object distance of the pictures
 TESTED = 7  # distances of the test, even in their reciprocal
 DISTANCES = 5  # of the closed form
-CYCLES = 6  # of the closed form, of DRT PSFs
+CYCLES = 8  # of the closed form
 ARMS = {
     "models": ("gaussian", "drt", "frozen"),
     "apart": ("file", "spot", "spot, together", "closed form", "closed form, together", "together"),
@@ -159,10 +159,7 @@ def trained_camera(study: Study, lens: Lens, name: str, arm: str, seed: int) -> 
         if not stored.exists():
             spectrum, start = spectrum_of(train_pictures, settings), time.process_time()
             distances = even_distances(one, DISTANCES, spread=settings.spread)
-            one.use("drt")
-            one.plan()
             optimise_closed_form(one, spectrum, distances=distances, steps=CYCLES, optimizer="lm")
-            one.use(settings.model)
             folder.mkdir(parents=True, exist_ok=True)
             torch.save({"seconds": time.process_time() - start, "variables": one.variables.state_dict()}, stored)
         content = torch.load(stored, weights_only=True)
