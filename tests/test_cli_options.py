@@ -43,6 +43,7 @@ DIFFERENT = {
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
     "--step": "codesign chooses the unit of its variables, sag takes a length",
     "--start": "compare-models chooses from two places, codesign takes a distance, too",
+    "--shape": "of a part, and of the area of encircled energy",
     "--element": "named elements, kinds that are learned, and several of either",
     "--configuration": "layout draws all of them in one figure",
     "--log": "optimize writes one; elsewhere the scale of a figure",

@@ -111,10 +111,10 @@ class DepthOfField(Analysis):
             return "-" if math.isnan(distance) else object_text(float(distance))
 
         blurred = torch.isnan(self.near)
-        at = "object distance    " if bool(blurred.all()) else "object in focus at "
+        label = "object distance    " if bool(blurred.all()) else "object in focus at "
         title = [
             f"sharp to {self.limit_text()}",
-            f"  {at}  {words(self.lens.surfaces[0].thickness)}, measured to surface 1",
+            f"  {label}  {words(self.lens.surfaces[0].thickness)}, measured to surface 1",
             f"  paraxial limits      {words(self.paraxial_near)} to {words(self.paraxial_far)}",
             f"  hyperfocal distance  {words(self.hyperfocal)}, near limit {words(self.hyperfocal_near)}; paraxial "
             f"{words(self.paraxial_hyperfocal)}, {words(self.paraxial_hyperfocal_near)}",

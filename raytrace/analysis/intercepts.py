@@ -116,8 +116,8 @@ class Intercepts(Analysis):
             quantity, _, rest = name.partition("_")
             if rest == "field_y":
                 columns[f"{quantity}_ray"] = rays[f"{quantity}_ray"]
-        at = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
-        largest = Table(columns, title=[f"largest numbers of all fields and rays, at {at} µm", ""])
+        wavelengths = ", ".join(f"{wavelength:g}" for wavelength in self.wavelengths.tolist())
+        largest = Table(columns, title=[f"largest numbers of all fields and rays, at {wavelengths} µm", ""])
         return [largest, Table(self.columns(), title=["", "each ray", ""])] if self.each else [largest]
 
     @styled
