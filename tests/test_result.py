@@ -17,7 +17,8 @@ _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
 _POWERS = (-6, -3, -2, 2, 3, 6)  # of ten, between units: mm and µm or m, parts and per cent, 1/K and 10⁻⁶/K
 _DIGITS = 4  # a printed number with fewer may agree with another one by chance
 _UNITS_UNPRINTED = ("evaluate", "info", "trace")  # units of rows by operand; mm and degrees of a prescription, of CSV
-#: Rays that `spot` saves as CSV, samples of curves whose text lists the widths, counts of keywords, and numbers each in the unit of its row or its criterion.
+#: Rays that `spot` saves as CSV, samples of curves whose text lists the widths, counts of keywords, and numbers each in
+#: the unit of its row or its criterion.
 _WITHOUT_LENGTHS = {
     "Arrivals",
     "CrossSection",

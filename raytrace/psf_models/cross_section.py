@@ -200,8 +200,8 @@ def cross_section(psfs: Psf, through: Literal["peak", "centroid"] = "peak") -> C
             curve = torch.where(shown[..., None], curve, torch.nan)
             part.append(torch.nn.functional.pad(curve, (0, most - size[a]), value=torch.nan))
     position, profile, spread = (torch.stack(part) for part in parts)
-    widths = [fwhm(position, curve) for curve in (profile, spread)]
-    return CrossSection(psfs, position, profile, spread, *widths, pitch, through)
+    profile_fwhm, spread_fwhm = (fwhm(position, curve) for curve in (profile, spread))
+    return CrossSection(psfs, position, profile, spread, profile_fwhm, spread_fwhm, pitch, through)
 
 
 def fwhm(position: Tensor, curve: Tensor) -> Tensor:

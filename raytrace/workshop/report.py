@@ -35,7 +35,7 @@ from raytrace.files import write_atomically
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, plain
 from raytrace.optimization.attained import attained_by, columns_of
-from raytrace.optimization.evaluate import evaluate
+from raytrace.optimization.evaluate import MeritResult, evaluate
 from raytrace.settings import ON_REQUEST, REPORTS, SECTIONS
 from raytrace.system.lens import Lens, field_points, with_wavelengths
 from raytrace.system.shapes import KINDS
@@ -271,11 +271,15 @@ def _conditions(request: _Request, writer: _Writer) -> None:
     data = lens.optimization_data
     if data is not None and any(row.weight > 0 for row in data.merit):
         writer.blocks.append(Heading("Merit function"))
-        writer.analysis("Merit function", lambda: dataclasses.replace(evaluate(lens), conditions=()))  # listed above
+        writer.analysis("Merit function", lambda: _without_conditions(evaluate(lens)))  # which are listed above
     if not writer.blocks and not writer.gaps:
         writer.gaps.append(
             "The lens stores no conditions and no merit function; `raytrace optimize --hold` adds conditions."
         )
+
+
+def _without_conditions(result: Result) -> Result:
+    return dataclasses.replace(result, conditions=()) if isinstance(result, MeritResult) else result
 
 
 def _tolerances(request: _Request, writer: _Writer) -> None:
