@@ -1,7 +1,7 @@
 """Processor time of training steps of cameras: python bench_steps.py [clipped] [built] [element]
 
 clipped: eight colour patches at eight places and object distances, forward and backward by curvatures and thicknesses,
-through a lens without rims and with rims that clip oblique beams, in turns.
+through a lens without rims and with rims at its semi-diameters, or a share of them, in turns.
 built: kernels of perturbed lenses, each at its own place and object distance, three wavelengths; the sensor follows the
 best focus of each lens.
 element: kernels of a height map of 200 × 200 pixels without a lens at four object distances, forward and backward by
@@ -52,7 +52,7 @@ def with_rims(lens: rt.Lens, share: float) -> rt.Lens:
 #: The lens, the share of its semi-diameters that its rims have, and the size of the sensor in mm.
 LENSES: Mapping[str, tuple[Callable[[], rt.Lens], float, tuple[float, float]]] = {
     "Cooke triplet": (lambda: rt.read_lens("cooke_triplet"), 0.8, (28.8, 21.6)),
-    "double Gauss": (lambda: rt.read_lens("double_gauss"), 0.9, (24.0, 18.0)),
+    "double Gauss": (lambda: rt.read_lens("double_gauss"), 1.0, (24.0, 18.0)),
     "C-mount lens": (c_mount, 0.25 * 0.7, (8.8, 6.6)),
 }
 

@@ -63,26 +63,23 @@ def file_of(*suffixes: str) -> Callable[[str], OutputFile]:
     return reader
 
 
+def _file_named(text: str, suffixes: tuple[str, ...], kind: str) -> OutputFile:
+    """A file to write whose name ends in one of the suffixes; kind: of its content, for the message."""
+    file = output_file(text)
+    file.suffixes = suffixes
+    if PurePath(text).suffix.lower() not in suffixes:
+        raise argparse.ArgumentTypeError(f"{text!r} is no {kind}: expected a name that ends in {', '.join(suffixes)}")
+    return file
+
+
 def drawing_file(text: str) -> OutputFile:
     """A drawing, or solids, to write."""
-    file = output_file(text)
-    file.suffixes = DRAWINGS
-    if PurePath(text).suffix.lower() not in file.suffixes:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no drawing: expected a name that ends in {', '.join(file.suffixes)}"
-        )
-    return file
+    return _file_named(text, DRAWINGS, "drawing")
 
 
 def report_file(text: str) -> OutputFile:
     """A report to write."""
-    file = output_file(text)
-    file.suffixes = REPORTS
-    if PurePath(text).suffix.lower() not in file.suffixes:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no report: expected a name that ends in {', '.join(file.suffixes)}"
-        )
-    return file
+    return _file_named(text, REPORTS, "report")
 
 
 def lens_file(text: str) -> OutputFile:
