@@ -48,7 +48,8 @@ _RIDGE = 0.01  # of the blur by a variable alone: least blur of a step whose par
 _SMALLEST = 1e-6  # of the RMS spot: blur of a step, below which its change of the gradient is rounding
 _LEAST = 1e-8  # eigenvalue of B relative to the largest
 _AGAIN = 1e-3  # relative decrease of the loss by a descent after which another one without pairs begins
-_JUMP = 0.4  # of the RMS spot: blur of the displacement of a restart
+_JUMP = 3.0  # of the RMS spot: blur of the displacement of a restart, and largest spot of the displaced lens
+_HALVINGS = 20  # of the displacement, at most
 #: Options of the solver: the residuals are a model without a second derivative along a step, and the last per mille of
 #: a loss is worth no further hundred cycles.
 OPTIONS = SolverOptions(bends=False, tolerance=3e-4)
@@ -105,10 +106,7 @@ class Lifted:
 
     def state(self, x: np.ndarray, derivatives: bool) -> LiftedLoss:
         rows = self.rows(x, derivatives)
-        try:
-            loss, gradient = self.function(x)
-        except EmptyPsf:  # of a trial lens, which is then refused
-            loss, gradient = np.inf, np.zeros(len(x))
+        loss, gradient = self._evaluated(x)
         limits = np.concatenate([rows.limits, rows.sides.excess])
         state = LiftedLoss(x, np.zeros(0), rows.lost, Sides.none(len(x)), rows.held, limits, loss=loss)
         if not derivatives:
@@ -125,6 +123,13 @@ class Lifted:
             held_slope=rows.held_slope,
             limits_slope=np.concatenate([rows.limits_slope, rows.sides.slope]),
         )
+
+    def _evaluated(self, x: np.ndarray) -> Slope:
+        """Loss and gradient (n,); inf and zeros where no light arrives, so that the trial lens is refused."""
+        try:
+            return self.function(x)
+        except EmptyPsf:
+            return np.inf, np.zeros(len(x))
 
     def _metric(self, rows: SumOfSquares) -> tuple[np.ndarray, float]:
         """The triangle U (n, n) of M = UᵀU, a step p of which makes an RMS blur |U p|, and the RMS spot."""
@@ -189,11 +194,18 @@ class Lifted:
             self.places.append(_Place(np.array(x), np.array(gradient), np.array(slope).reshape(-1, len(x))))
 
     def displaced(self, x: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """Variables from x in a random direction, as far as makes a blur of 0.4 of the RMS spot, within the bounds."""
+        """Variables from x in a random direction, within the bounds, as far as makes a blur of 3 RMS spots by the
+        derivatives; half as far until the spot is at most 3 times as large and the loss is finite."""
         blur, spot = self._metric(self.rows(x, True))
         direction = random.standard_normal(len(x))
-        step = scipy.linalg.solve_triangular(blur, direction)
-        return np.clip(x + _JUMP * spot / float(np.linalg.norm(direction)) * step, self.lower, self.upper)
+        step = _JUMP * spot / float(np.linalg.norm(direction)) * scipy.linalg.solve_triangular(blur, direction)
+        for _ in range(_HALVINGS):
+            near = np.clip(x + step, self.lower, self.upper)
+            size = float(np.linalg.norm(self.rows(near, False).residuals))
+            if size <= _JUMP * spot and np.isfinite(self._evaluated(near)[0]):
+                return near
+            step = 0.5 * step
+        return x
 
     def minimise_rows(self, x: np.ndarray, *, cycles: int = 100, until: float = np.inf) -> Descent:
         """Descend from x to the minimum of the rows."""

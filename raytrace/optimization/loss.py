@@ -11,11 +11,12 @@ from torch import Tensor
 
 from raytrace.maths.numerics import value
 from raytrace.maths.result import plain
-from raytrace.optimization.least_squares import Cycle, CycleStart, Descent
+from raytrace.optimization.least_squares import Cycle, CycleStart, Descent, SumOfSquares
 from raytrace.optimization.lifted import Lifted
 from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem, typical_of
 from raytrace.optimization.quantities import Quantity, of_configurations
+from raytrace.psf_models import EmptyPsf
 from raytrace.system.lens import Lens
 from raytrace.words import option
 
@@ -81,8 +82,8 @@ class Loss:
 @value
 class LossReport:
     """The loss by stage: start, the initial lens; first, after the rows that are minimised first (pre-optimisation);
-    ends, after each descent, the first from there, the others from displaced lenses; end, of the final lens with the
-    rays of the descent; checked, with denser rays.
+    ends, after each descent, the first from there, the others from displaced lenses, of which the best by denser rays
+    counts; end, of the final lens with the rays of the descent; checked, with denser rays, inf where these fail.
 
     first: nan where rays that the loss needs fail there: the descent then begins at the initial lens; has_first:
     whether rows were minimised first; refined: descents with more rays, because a check changed the loss by more than
@@ -115,6 +116,10 @@ class LossReport:
                 f"denser rays change the loss by more than 2 %: raise {option('cycles')}, or sample "
                 "more densely, as by of=Points(rings=16)"
             )
+        if np.isinf(self.checked):
+            lines.append(
+                "denser rays fail, so that their loss is unknown: sample more densely, as by of=Points(rings=16)"
+            )
         return lines
 
 
@@ -128,6 +133,15 @@ class LossDescent:
     cycles: int
     evaluations: int
     report: LossReport
+
+
+def _finite_or_inf(function: FunctionMerit, x: np.ndarray) -> float:
+    """The loss at x (n,); inf where its rays fail."""
+    try:
+        loss = function(x)[0]
+    except EmptyPsf:
+        return np.inf
+    return loss if np.isfinite(loss) else np.inf
 
 
 class LossDescents:
@@ -177,19 +191,20 @@ class LossDescents:
         ends, checked, refined, evaluations = [best.state.cost], np.nan, 0, 0
         random, loss = np.random.default_rng(0), self.loss
         try:
+            least = self._judged(best)
             for _ in range(restarts):
                 if self._is_over():
                     break
                 near = self._lifted(self.function).displaced(best.state.x, random)
-                if np.isfinite(self.function(near)[0]):
-                    descent = self._descend(self.function, near, watch)
-                    ends.append(descent.state.cost)
-                    best = descent if descent.state.is_better(best.state) else best
+                descent = self._descend(self.function, near, watch)
+                ends.append(descent.state.cost)
+                judged = self._judged(descent)
+                best, least = (descent, judged) if judged.is_better(least) else (best, least)
             while (denser := loss.denser()) is not None:
                 function, loss = FunctionMerit(self.problem.model, denser), denser
-                checked = function(best.state.x)[0]
+                checked = _finite_or_inf(function, best.state.x)
                 is_same = abs(checked - best.state.cost) <= _DENSER_CHANGE * abs(checked)
-                if is_same or self._is_over() or refined == _ROUNDS:
+                if is_same or not np.isfinite(checked) or self._is_over() or refined == _ROUNDS:
                     break
                 best, refined = self._descend(function, best.state.x, watch), refined + 1
                 evaluations += function.evaluations
@@ -200,6 +215,15 @@ class LossDescents:
             best.state.x, tuple(self.history), self.stopped or best.stopped, cycles_used + len(self.history),
             evaluations + self.function.evaluations, report,
         )  # fmt: skip
+
+    def _judged(self, descent: Descent) -> SumOfSquares:
+        """The end of a descent with the loss by denser rays, inf where these fail: few rays may fit a wide PSF that
+        more rays do not have."""
+        denser = self.loss.denser()
+        if denser is None:
+            return descent.state
+        loss = _finite_or_inf(FunctionMerit(self.problem.model, denser), descent.state.x)
+        return dataclasses.replace(descent.state, loss=loss)
 
     def _is_over(self) -> bool:
         return bool(self.stopped) or len(self.history) >= self.cycle_limit or time.monotonic() > self.deadline

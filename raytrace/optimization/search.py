@@ -501,7 +501,7 @@ def _followed_by_loss(
         if end.stopped in ("interrupted", "seconds"):
             raise SearchStopped
         missed = float(task.whole.state(end.x, False).missed.max(initial=0.0))
-        value = end.report.checked if np.isfinite(end.report.checked) else end.report.end
+        value = end.report.end if np.isnan(end.report.checked) else end.report.checked
         return TaskResult(0.0, missed, value, time.process_time() - begun, end.x)
 
     @torch.no_grad()
