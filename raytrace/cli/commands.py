@@ -173,6 +173,9 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("semi_diameters", None, "SURFACES", "*", "semi-diameters by the rays of all fields, wavelengths and "
      "configurations: margin=2,0.5 per cent and mm beyond the rays; clear=12 mm, fixed, or auto; chip_zone=0.5 mm "
      "beyond the clear ones; mechanical=12.7 mm of the part, fixed, or auto; of some surfaces, or of all"),
+    ("temperatures", None, "C", "+", "the lens at other temperatures as configurations, °C as -20 60, that of the lens "
+     "first: radii, thicknesses and aspheres by thermal pickups, so that `optimize` makes it athermal; --mount is the "
+     "material of its spaces, 4=invar that of the space behind surface 4"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
 )  # fmt: skip
@@ -307,7 +310,7 @@ COMMANDS = (
     ),
     _command(
         "edit",
-        "scale, reverse, split, bend, insert, delete, semi-diameters",
+        "scale, reverse, split, bend, insert, delete, semi-diameters, temperatures",
         """\
 Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
 have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
@@ -326,6 +329,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         lens.zmx --semi-diameters margin=2,0.5 chip_zone=0.5 --semi-diameters 1-2 mechanical=12.7 -o sized.zmx
         lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
         lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx
+        cooke_triplet --temperatures -20 60 --mount aluminium -o warm.zmx
         lens.zmx --insert-part 3 AC254-050-A reversed gap=2 -o with_part.zmx
         lens.zmx --replace-part 1-2 vendor/LA1131-A.zmx reversed -o replaced.zmx""",
         *LENS,
@@ -334,6 +338,8 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
             *(Option(name, reader, metavar, help, nargs=nargs, action=Step)
               for name, reader, metavar, nargs, help in EDITS),
         ),
+        row("mount", "of all spaces without a stated expansion, stored in the lens: aluminium, titanium, invar, "
+            "stainless-304 …, or its expansion in 1e-6/K"),
         Option("output", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", "-o --output",
                required=True), run="cli.runs:edit",
     ),
