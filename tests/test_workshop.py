@@ -119,6 +119,21 @@ def test_indications_follow_from_tolerances():
     assert stated("0/20 1/3x0.16 2/1;1") == {"0": "0/20", "1": "1/3×0.16", "2": "2/1;1"}
 
 
+def test_radial_tolerances_are_on_the_sheets():
+    """The magnitudes of the grade, whose figures along x and y they replace."""
+    drawings = rt.draw("cooke_triplet", elements=[1], grade="precision", radial=True)
+    assert drawings.indications.mounting(1, 2) == ("0.05 radial", "3′ radial")
+    assert rt.draw("cooke_triplet", grade="precision").indications.mounting(1, 2) == ("± 0.05", "± 3′")
+    texts = [text for *_, text, _ in drawings.sheet(1).texts]
+    assert "decentre in the mount 0.05 radial" in texts
+    table = rt.tolerances(rt.read_lens("cooke_triplet"), grade="precision", radial=True)
+    assert drawings.indications.radial == {
+        (error.name, table[first].surfaces): error.magnitude for first, error in table.radial.items()
+    }
+    with pytest.raises(rt.BadTolerance, match=r"radial.* goes with .*grade.* or .*limits"):
+        rt.draw("cooke_triplet", radial=True)
+
+
 # -- sheets
 
 

@@ -384,6 +384,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
             "requirements",
             row("grade", "tolerances of a published grade instead of the file's"),
             row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            "radial",
             Option("indications", None, "N/VALUE", "further indications of ISO 10110 of all parts: 0/20 1/3x0.16 2/1;1 "
                 "5/5x0.25 6/-; others are dashes", nargs="+", default=""),
             Option("coating", None, "TEXT", "of all surfaces in air", default=""),
@@ -428,6 +429,7 @@ on request: {", ".join(ON_REQUEST)}""",
             "tolerances",
             row("grade", "tolerances of a published grade instead of the file's"),
             row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            "radial",
             switch("tolerance", "with the section as-built: sensitivities, expectation and Monte Carlo, as of "
                 "`tolerance`"),
             Option("criterion", help="of the lens as built, as of `tolerance`", default="rms"),
@@ -1171,8 +1173,7 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
             "those of the file or the grade, and index=0 leaves one out; element_decenter_radial=0.02 is the magnitude "
             "of a decentre in a random direction", default=""),
-        switch("radial", "decentres, tilts and wedges of the grade and of --limits are magnitudes in a random "
-            "direction, x and y linked; wedge_radial=0.01 is one of these alone"),
+        "radial",
         Option("criterion", help="rms, the RMS spot radius in µm over fields and wavelengths by their "
             "weights, each field about the centroid of its light, of an afocal lens that of angle, the RMS angle in "
             "mrad of the rays; wavefront, the RMS wavefront in waves less mean and tilt; mtf@30, the MTF of "

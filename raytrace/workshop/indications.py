@@ -14,7 +14,10 @@ A dash: the lens has no such tolerance.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from raytrace.system.lens import Lens
 from raytrace.system.tolerance_data import Tolerance
+from raytrace.tolerancing.files import tolerances_of
+from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.table import ToleranceTable
 from raytrace.words import RaytraceError
 from raytrace.workshop.parts import Face, Part
@@ -58,6 +61,13 @@ def limits(row: Tolerance | None, factor: float = 1.0, unit: str = "", digits: i
     low, high = sorted((row.minimum * factor, row.maximum * factor))
     text = f"± {high:.{digits}g}" if math.isclose(-low, high) else f"{high:+.{digits}g} {low:+.{digits}g}"
     return f"{text}{unit}".replace("-", "−")
+
+
+def tolerances_for(lens: Lens, limits: str | Sequence[str], *, grade: str | None, radial: bool) -> ToleranceTable:
+    """The tolerances of a document: of a grade and of limits, as of `tolerances`, else those of the lens, or none."""
+    if grade or limits or radial:
+        return tolerances(lens, limits, grade=grade, radial=radial)
+    return tolerances_of(lens)
 
 
 class Indications:

@@ -27,12 +27,10 @@ from raytrace.settings import DRAWINGS
 from raytrace.system.elements import cemented_groups
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.tolerancing.files import tolerances_of
-from raytrace.tolerancing.grades import tolerances
 from raytrace.tracing.lens_report import remarks
 from raytrace.words import option
 from raytrace.workshop import dxf, step
-from raytrace.workshop.indications import Indications, limits, stated
+from raytrace.workshop.indications import Indications, limits, stated, tolerances_for
 from raytrace.workshop.paper import HEIGHT, MARGIN, WIDTH, Paper, scale_for, scale_text
 from raytrace.workshop.parts import Face, Part, parts_of
 
@@ -154,6 +152,7 @@ def draw(
     elements: Sequence[int] | None = None,
     grade: str | None = None,
     limits: str | Sequence[str] = "",
+    radial: bool = False,
     indications: str | Sequence[str] = "",
     coating: str = "",
     margin: float = 0.0,
@@ -165,8 +164,8 @@ def draw(
 
     elements: numbers of the elements with a sheet of their own, from 1 in the order of the light, without the sheet of
     the whole lens; (): all of them and the whole lens; None: the whole lens alone.
-    grade, limits: tolerances, as of `tolerances`, by default those of the lens. indications: further ones of all parts,
-    "0/20 1/3x0.16 2/1;1 5/5x0.25 6/-"; coating: of all surfaces in air. What is not specified is a dash.
+    grade, limits, radial: tolerances, as of `tolerances`, by default those of the lens. indications: further ones of
+    all parts, "0/20 1/3x0.16 2/1;1 5/5x0.25 6/-"; coating: of all surfaces in air. What is not specified is a dash.
     margin: mm added to mechanical semi-diameters that are not fixed; chamfer: mm of both legs, at 45°; substrate:
     thickness in mm of mirrors, by default a sixth of their diameter; date: of the title block. `save` writes .pdf,
     .svg, .png, .dxf or .step. Raises ValueError, NoSolid, BadTolerance, BadIndication.
@@ -191,7 +190,7 @@ def draw(
         tuple(part.name for part in parts if first <= part.surfaces[0] and part.surfaces[1] <= last)
         for first, last in cemented_groups(lens)
     )
-    table = tolerances(lens, limits, grade=grade) if grade or limits else tolerances_of(lens)
+    table = tolerances_for(lens, limits, grade=grade, radial=radial)
     chosen = () if elements is None else tuple(map(str, elements)) if elements else tuple(names)
     words = Indications(table, stated(indications), coating)
     return Drawings(lens, tuple(parts), groups, chosen, not elements, words, date)
