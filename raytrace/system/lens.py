@@ -547,8 +547,8 @@ class Lens:
         lens = with_environment(self if mount is None else with_mount(self, mount), None, None)
         others = [celsius for celsius in temperatures if not _is_at(lens, celsius)]
         if not others:
-            own = f"{temperature_of(lens):g} °C, that of the lens"
-            raise ValueError(f"{option('temperatures')} {[*temperatures]}: expected one other than {own}")
+            reference = f"{temperature_of(lens):g} °C, that of the lens"
+            raise ValueError(f"{option('temperatures')} {[*temperatures]}: expected one other than {reference}")
         heights = contact_heights(lens, in_contact(lens.surfaces))
         sizes = {k: float(height.detach()) or None for k, height in heights.items()}
         surfaces = tuple(
