@@ -348,6 +348,9 @@ _ELSEWHERE = {
     ),
     **dict.fromkeys(("efl", "focal_length", "effective_focal_length"), "; rt.first_order(lens).effective_focal_length"),
     "f_number": "; rt.first_order(lens).f_number",
+    **dict.fromkeys(("save", "write", "export", "to_file", "to_zmx"), "; rt.write_lens(lens, path) writes its file"),
+    "plot": "; rt.layout(lens).plot(path) draws it",
+    **{name: f"; rt.{name}(lens)" for name in ("info", "layout", "draw", "trace", "spot", "mtf", "psf", "optimize")},
 }
 
 
