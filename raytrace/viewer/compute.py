@@ -33,7 +33,7 @@ from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, semi_diameters
 from raytrace.tracing.launch import unfilled
-from raytrace.tracing.paraxial import at_infinity, first_order
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
 from raytrace.viewer.state import State, has_merit, shown_fields, slider_ends, word_of
 
@@ -172,7 +172,8 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
 
 def first_order_of(lens: Lens) -> list[dict]:
     """First-order data and the working F/#: name, value and unit; words of a value that is infinite in practice."""
-    data, infinite = first_order(lens), at_infinity(lens)
+    data = first_order(lens)
+    infinite = data.infinite()
     names = {"EFL": "effective_focal_length", "entrance pupil": "entrance_pupil_position",
         "exit pupil": "exit_pupil_position"}  # fmt: skip
     rows = (
