@@ -250,6 +250,21 @@ def test_a_user_catalog_that_cannot_be_read_is_an_error(tmp_path, monkeypatch):
         find_glass("N-BK7")
 
 
+def test_a_user_catalog_may_be_a_shipped_one(monkeypatch, tmp_path):
+    """In Python, in the environment and in the command; a folder of its name does not hide it."""
+    (tmp_path / "hoya").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert find_glass("BSC7", user=["hoya"]).catalog == "HOYA"
+    for name, expected in (("SCHOTT", {"SCHOTT"}), ("HIKARI", {"HIKARI"})):
+        lens = rt.read_lens("double_gauss", catalogs=[name])
+        assert {s.glass.catalog for s in lens.surfaces if s.glass.catalog} == expected
+    assert rt.glass("N-BK7", catalogs=["SCHOTT"]).glass.catalog == "SCHOTT"
+    with pytest.raises(CatalogError, match=r"SCHOT: no such glass catalog; .*OHARA.*did you mean SCHOTT\?"):
+        rt.read_lens("tessar", catalogs=["SCHOT"])
+    monkeypatch.setenv(catalogs.ENVIRONMENT, "ohara")
+    assert find_glass("S-BSL7").catalog == "OHARA"
+
+
 def test_a_changed_user_catalog_is_read_again(small):
     assert find_glass("ONE", user=[small]).nd_listed == 1.5168
     small.write_text(SMALL.replace("1.516800", "1.5168001"))

@@ -557,9 +557,38 @@ def test_the_command_edits_in_order(tmp_path, capsys):
     assert rt.read_lens(out).name == "fifty"
 
 
+def test_the_command_writes_temperatures_that_an_optimisation_makes_athermal(tmp_path, capsys):
+    out, better = str(tmp_path / "warm.zmx"), str(tmp_path / "athermal.zmx")
+    words = ["--temperatures", "-20", "20", "60", "5=invar", "--mount", "aluminium", "--json", "-o", out]
+    assert main(["edit", "cooke_triplet", *words]) == 0
+    assert json.loads(capsys.readouterr().out)["configurations"] == {"before": 1, "after": 3}
+    warm = rt.read_lens(out)
+    assert [float(each.environment.temperature) for each in warm.configurations] == [20, -20, 60]
+    assert {k: float(warm.surfaces[k].expansion) for k in (2, 4, 5, 7)} == {2: 23.6, 4: 23.6, 5: 1.3, 7: 23.6}
+    hot = rt.read_lens("cooke_triplet").replace(5, expansion=1.3).at(mount="aluminium").at(temperature=60)
+    for one, other in zip(warm.configuration(3).surfaces, hot.surfaces, strict=True):
+        assert float(one.thickness) == pytest.approx(float(other.thickness), rel=1e-12)
+    words = ["--merit", "spot", "--vary", "sensor", "spacer:7", "--mounts", "aluminium", "invar", "-o", better]
+    assert main(["optimize", out, *words]) == 0
+    shifts = [rt.thermal(rt.read_lens(path), samples=2, measure="focus").focus_shift for path in (out, better)]
+    assert float((shifts[1][1] - shifts[1][0]).abs()) < 0.5 * float((shifts[0][1] - shifts[0][0]).abs())
+
+
+def test_a_mount_alone_states_the_expansion_of_all_spaces(tmp_path):
+    out = str(tmp_path / "mounted.zmx")
+    words = ["--insert", "3", "radius=inf,thickness=2,glass=N-BK7", "thickness=1", "--mount", "titanium"]
+    assert main(["edit", "cooke_triplet", *words, "-o", out]) == 0
+    stated = [surface.expansion for surface in rt.read_lens(out).surfaces]
+    assert [k for k, each in enumerate(stated) if each is not None] == [2, 4, 6, 7, 9]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["--temperatures", "hot"], "--temperatures hot: expected °C"),
+        (["--temperatures", "20"], "expected one other than 20 °C, that of the lens"),
+        (["--temperatures", "60", "1=invar"], "no space behind 1; this lens has spaces behind 2, 4, 5, 7"),
+        (["--temperatures", "60", "--mount", "wood"], "mount 'wood': expected one of aluminium"),
         ([], "no edit is given"),
         (["--reverse", "foo"], "no surface has the comment 'foo'"),
         (["--bend", "1-2"], "no surfaces; give numbers as 3-4"),

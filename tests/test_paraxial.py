@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -222,13 +223,30 @@ def test_every_entry_is_differentiable_and_per_wavelength():
     def numbers(c):
         data = first_order(double_gauss(object_distance=700.0).replace(1, curvature=c))
         return tuple(
-            torch.atleast_1d(getattr(data, f.name))
-            for f in dataclasses.fields(data)
-            if f.name != "entrance_pupil_diameter"
+            torch.atleast_1d(entry) for name, entry in data.columns().items() if name != "entrance_pupil_diameter"
         )
 
     assert gradcheck(numbers, c, eps=1e-7, atol=1e-2, rtol=1e-5)
     assert first_order(system, vector(0.5, 0.6, 0.7)).effective_focal_length.shape == (3,)
+
+
+def test_a_quantity_that_is_infinite_in_practice_is_printed_in_words():
+    """As in `info`; a number of another lens, and the table of the file, keep it."""
+    data = rt.first_order(rt.read_lens(Path(__file__).parent / "cases" / "telecentric.zmx"))
+    assert data.infinite() == {
+        "effective_focal_length": "afocal", "entrance_pupil_position": "telecentric", "exit_pupil_position":
+        "telecentric", "exit_pupil_diameter": "infinite", "back_focal_distance": "infinite", "front_focal_distance":
+        "infinite", "front_principal_plane": "infinite", "rear_principal_plane": "infinite",
+    }  # fmt: skip
+    assert data.telecentric_spaces == ["object", "image"]
+    printed = str(data).splitlines()
+    assert re.fullmatch(r"effective focal length +afocal +mm; -2\.146e\+06 mm by first-order data", printed[0])
+    assert re.fullmatch(r"exit pupil position +telecentric +mm, from the image; .*", printed[7])
+    rows = [re.sub(r"  +", "  ", line) for line in printed]
+    quantities = rt.info(rt.read_lens(Path(__file__).parent / "cases" / "telecentric.zmx")).quantities()
+    assert {"  ".join(row).rstrip() for row in quantities if row[0] != "working F/#"} <= set(rows)
+    assert data.columns()["effective_focal_length"].item() == pytest.approx(-(50**2) / 0.001165, rel=1e-3)
+    assert rt.first_order(double_gauss()).infinite() == {}
 
 
 @each

@@ -616,6 +616,13 @@ def test_the_functions_of_tolerances_have_their_public_names():
     assert rt.tolerances.__name__ == "tolerances"
 
 
+def test_a_lens_says_how_it_is_written_and_drawn():
+    pairs = {"save": r"rt\.write_lens\(lens, path\)", "plot": r"rt\.layout\(lens\)", "spot": r"rt\.spot\(lens\)"}
+    for name, words in pairs.items():
+        with pytest.raises(AttributeError, match=f"'Lens' object has no attribute '{name}'; {words}"):
+            getattr(rt.read_lens("singlet"), name)
+
+
 @pytest.mark.parametrize("name", ["efl", "focal_length", "effective_focal_length", "f_number"])
 def test_first_order_data_that_a_lens_lacks_are_named_with_their_function(name):
     with pytest.raises(AttributeError, match=r"rt\.first_order\(lens\)\.(effective_focal_length|f_number)$"):

@@ -84,6 +84,13 @@ def test_every_number_is_that_of_the_function(report):
         assert results(report, name) == json.loads(json.dumps([one.document() for one in functions])), name
 
 
+def test_radial_tolerances_are_those_of_the_function():
+    lens = rt.read_lens("cooke_triplet")
+    options = {"grade": "precision", "radial": True}
+    document = rt.report(lens, only=["tolerances"], **options, date=DATE)
+    assert results(document, "tolerances") == json.loads(json.dumps([rt.tolerances(lens, **options).document()]))
+
+
 def test_the_pages_hold_the_numbers_and_are_counted(report):
     content = pdf(report.content)
     pages = text_of(content)

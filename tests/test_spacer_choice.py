@@ -7,7 +7,8 @@ import torch
 
 import raytrace as rt
 from raytrace.materials.mounts import MOUNTS
-from raytrace.optimization.spacer_choice import spaces_of, with_spacers, without_spacers
+from raytrace.optimization.spacer_choice import with_spacers, without_spacers
+from raytrace.system.expansion import spaces
 
 WARM = (-20.0, 60.0)
 
@@ -33,7 +34,7 @@ def thermal_defocus(lens):
 
 def test_spaces_are_those_of_air():
     lens = achromat()
-    assert spaces_of(lens) == [2, 4]
+    assert spaces(lens.surfaces) == [2, 4]
     warm = lens.with_temperatures(WARM)
     assert without_spacers(warm, "sensor spacer glass") == (["sensor", "glass"], [(2,), (4,)])
     assert without_spacers(warm, "sensor barrel") == (["sensor"], [(2, 4)])

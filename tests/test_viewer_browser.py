@@ -199,6 +199,18 @@ def test_numbers_are_typed_undone_and_redone_by_keys(page):
     assert cell(page, "thickness:4") > 2
 
 
+def test_sizes_of_parts_are_typed_and_freed(page):
+    page.get_by_label("all numbers").check()
+    cell, zone = page.locator("[data-cell='mechanical_semi_diameter:3']"), page.locator("[data-cell='chip_zone:3']")
+    assert "automatic" in cell.get_attribute("class")
+    changed(page, lambda: (cell.fill("15.5"), cell.press("Tab")))
+    assert "automatic" not in cell.get_attribute("class")
+    page.get_by_label("all numbers").uncheck()
+    assert (cell.input_value(), zone.count()) == ("15.5", 0)
+    changed(page, lambda: (cell.fill(""), cell.press("Tab")))
+    assert cell.count() == 0
+
+
 def test_keys_act_after_a_click_beside_the_controls(page):
     changed(page, lambda: typed(page, "thickness:2", "13.5"))
     page.mouse.click(640, 715)

@@ -166,6 +166,28 @@ def test_glass_conic_and_semi_diameter_are_edited(state):
     assert edit(found, "semi_diameter", 1, "").lens.surfaces[1].semi_diameter is None
 
 
+def test_mechanical_semi_diameters_and_chip_zones_are_shown_as_in_info_and_edited(triplet):
+    sized = rt.edit.semi_diameters(triplet, chip_zone=0.5).with_semi_diameters(fixed=[3])
+    sized = rt.edit.semi_diameters(sized, "1-2", mechanical=16.0)
+    rows, columns = compute.prescription(initial(sized))["rows"], rt.info(sized).columns()
+    assert [row["semi_diameter"] for row in rows[1:]] == columns["semi_diameter"].tolist()[1:]
+    assert [row["mechanical_semi_diameter"] for row in rows[1:]] == columns["mechanical_semi_diameter"].tolist()[1:]
+    assert [row["chip_zone"] for row in rows[1:5]] == [0.5, 0.5, 0.5, 0.5]
+    fixed = [["mechanical_semi_diameter"], ["mechanical_semi_diameter"], ["semi_diameter"], []]
+    assert [row["fixed"] for row in rows[1:5]] == fixed
+    drawn = compute.layout_of(sized, sized.fields.y.new_tensor([[0.0], [0.0]]))
+    glass = next(shape for shape in drawn["shapes"] if shape["kind"] == "area" and "glass" in shape["id"])
+    assert max(y for y in glass["points"][1]) == pytest.approx(16.0, abs=1e-3)
+    found = edit(edit(initial(sized), "mechanical_semi_diameter", 1, "17.5"), "chip_zone", 1, "0.25")
+    assert (found.message, found.lens.surfaces[1].mechanical_semi_diameter) == ("", 17.5)
+    assert found.lens.surfaces[1].chip_zone == 0.25
+    freed = edit(edit(found, "mechanical_semi_diameter", 1, ""), "chip_zone", 1, "")
+    assert (freed.lens.surfaces[1].mechanical_semi_diameter, freed.lens.surfaces[1].chip_zone) == (None, None)
+    small = edit(found, "mechanical_semi_diameter", 1, "3")
+    assert small.lens.surfaces[1].mechanical_semi_diameter == 17.5
+    assert "smaller than the clear one" in small.message
+
+
 def test_conditions(state):
     fields = reduce(state, {"type": "fields", "values": "0 5, 10; 15"})
     assert fields.lens.fields.y.tolist() == [0, 5, 10, 15]

@@ -11,7 +11,7 @@ import pytest
 
 import raytrace as rt
 from raytrace.workshop import dxf, step
-from raytrace.workshop.indications import stated
+from raytrace.workshop.indications import stated, toleranced
 from raytrace.workshop.parts import DEVIATION, NoSolid, parts_of
 
 RADII, THICKNESS, SEMI = (50.0, -80.0), 8.0, 12.0
@@ -117,6 +117,48 @@ def test_indications_follow_from_tolerances():
     assert words.centring(back) == "4/2.9′"
     assert words.others(part) == ["conic of surface 1: -0.01 to 0.01"]
     assert stated("0/20 1/3x0.16 2/1;1") == {"0": "0/20", "1": "1/3×0.16", "2": "2/1;1"}
+
+
+def test_radial_tolerances_are_on_the_sheets():
+    """The magnitudes of the grade, whose figures along x and y they replace."""
+    drawings = rt.draw("cooke_triplet", elements=[1], grade="precision", radial=True)
+    assert drawings.indications.mounting(1, 2) == ("0.05 radial", "3′ radial")
+    assert rt.draw("cooke_triplet", grade="precision").indications.mounting(1, 2) == ("± 0.05", "± 3′")
+    texts = [text for *_, text, _ in drawings.sheet(1).texts]
+    assert "decentre in the mount 0.05 radial" in texts
+    table = rt.tolerances(rt.read_lens("cooke_triplet"), grade="precision", radial=True)
+    assert drawings.indications.radial == {
+        (error.name, table[first].surfaces): error.magnitude for first, error in table.radial.items()
+    }
+    with pytest.raises(rt.BadTolerance, match=r"radial.* goes with .*grade.* or .*limits"):
+        rt.draw("cooke_triplet", radial=True)
+
+
+@pytest.mark.parametrize(
+    ("length", "limit", "text"),
+    [(8.74664, 0.05, "8.747 ± 0.05"), (8.74664, 0.2, "8.75 ± 0.2"), (8.74664, 5, "8.75 ± 5"), (14, 0.05, "14 ± 0.05"),
+     (8.74664, 0.01, "8.747 ± 0.01"), (0.2494321, 0.001, "0.2494 ± 0.001"), (8.74664, None, "8.747")],
+)  # fmt: skip
+def test_a_length_is_printed_to_a_tenth_of_its_tolerance(length, limit, text):
+    row = None if limit is None else rt.system.Tolerance("thickness", (1,), -limit, limit)
+    assert toleranced(length, row) == text
+
+
+def test_diameters_are_rounded_up_in_drawings_and_solids():
+    """A fixed mechanical diameter is as in the file, and no clear one is larger."""
+    exact = rt.tracing.geometry.semi_diameters(rt.read_lens("phone"))
+    for part in parts_of(rt.read_lens("phone")):
+        for face in part.faces:
+            assert exact[face.number] <= face.clear < exact[face.number] + 0.005
+            assert 100 * 2 * face.clear == pytest.approx(round(100 * 2 * face.clear), abs=1e-9)
+            assert part.rim >= face.clear
+    (part,) = parts_of(singlet({"semi_diameter": 9.6212}, {"semi_diameter": 4.0}), margin=1.0)
+    assert (part.faces[0].clear, part.rim) == (9.625, 10.625)
+    fixed = singlet({"semi_diameter": 9.6212, "mechanical_semi_diameter": 9.6212}, {"semi_diameter": 0.30011})
+    (part,) = parts_of(fixed)
+    assert (part.faces[0].clear, part.faces[1].clear, part.rim) == (9.6212, 0.3005, 9.6212)
+    texts = [text for *_, text, _ in rt.draw(fixed, elements=[1]).sheet(1).texts]
+    assert {"⌀ 19.2424", "⌀e 19.2424", "⌀e 0.601"} <= set(texts)
 
 
 # -- sheets

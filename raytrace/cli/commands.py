@@ -173,6 +173,9 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("semi_diameters", None, "SURFACES", "*", "semi-diameters by the rays of all fields, wavelengths and "
      "configurations: margin=2,0.5 per cent and mm beyond the rays; clear=12 mm, fixed, or auto; chip_zone=0.5 mm "
      "beyond the clear ones; mechanical=12.7 mm of the part, fixed, or auto; of some surfaces, or of all"),
+    ("temperatures", None, "C", "+", "the lens at other temperatures as configurations, °C as -20 60, that of the lens "
+     "first: radii, thicknesses and aspheres by thermal pickups, so that `optimize` makes it athermal; --mount is the "
+     "material of its spaces, 4=invar that of the space behind surface 4"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
 )  # fmt: skip
@@ -307,7 +310,7 @@ COMMANDS = (
     ),
     _command(
         "edit",
-        "scale, reverse, split, bend, insert, delete, semi-diameters",
+        "scale, reverse, split, bend, insert, delete, semi-diameters, temperatures",
         """\
 Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
 have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
@@ -326,6 +329,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         lens.zmx --semi-diameters margin=2,0.5 chip_zone=0.5 --semi-diameters 1-2 mechanical=12.7 -o sized.zmx
         lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
         lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx
+        cooke_triplet --temperatures -20 60 --mount aluminium -o warm.zmx
         lens.zmx --insert-part 3 AC254-050-A reversed gap=2 -o with_part.zmx
         lens.zmx --replace-part 1-2 vendor/LA1131-A.zmx reversed -o replaced.zmx""",
         *LENS,
@@ -334,6 +338,8 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
             *(Option(name, reader, metavar, help, nargs=nargs, action=Step)
               for name, reader, metavar, nargs, help in EDITS),
         ),
+        row("mount", "of all spaces without a stated expansion, stored in the lens: aluminium, titanium, invar, "
+            "stainless-304 …, or its expansion in 1e-6/K"),
         Option("output", lens_file, "OUT", "lens file to write: .zmx, .seq, .csv, .tsv, .txt", "-o --output",
                required=True), run="cli.runs:edit",
     ),
@@ -378,6 +384,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
             "requirements",
             row("grade", "tolerances of a published grade instead of the file's"),
             row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            "radial",
             Option("indications", None, "N/VALUE", "further indications of ISO 10110 of all parts: 0/20 1/3x0.16 2/1;1 "
                 "5/5x0.25 6/-; others are dashes", nargs="+", default=""),
             Option("coating", None, "TEXT", "of all surfaces in air", default=""),
@@ -422,6 +429,7 @@ on request: {", ".join(ON_REQUEST)}""",
             "tolerances",
             row("grade", "tolerances of a published grade instead of the file's"),
             row("limits", "words and kinds with their limits ±, as of `tolerance`", default=""),
+            "radial",
             switch("tolerance", "with the section as-built: sensitivities, expectation and Monte Carlo, as of "
                 "`tolerance`"),
             Option("criterion", help="of the lens as built, as of `tolerance`", default="rms"),
@@ -1165,8 +1173,7 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
             "those of the file or the grade, and index=0 leaves one out; element_decenter_radial=0.02 is the magnitude "
             "of a decentre in a random direction", default=""),
-        switch("radial", "decentres, tilts and wedges of the grade and of --limits are magnitudes in a random "
-            "direction, x and y linked; wedge_radial=0.01 is one of these alone"),
+        "radial",
         Option("criterion", help="rms, the RMS spot radius in µm over fields and wavelengths by their "
             "weights, each field about the centroid of its light, of an afocal lens that of angle, the RMS angle in "
             "mrad of the rays; wavefront, the RMS wavefront in waves less mean and tilt; mtf@30, the MTF of "

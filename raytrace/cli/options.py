@@ -147,6 +147,8 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("grade", help="tolerances of a published grade (default: those of the file)", choices=GRADES),
     Option("limits", None, "NAME=LIMIT", "other limits, as radius=0.1% thickness=0.02 element_tilt=0.05; index=0 "
            "leaves one out", nargs="+"),
+    switch("radial", "decentres, tilts and wedges of the grade and of --limits are magnitudes in a random direction, "
+           "x and y linked; wedge_radial=0.01 is one of these alone"),
 )}  # fmt: skip
 
 

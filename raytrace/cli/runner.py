@@ -19,7 +19,7 @@ from raytrace.cli.progress import progress
 from raytrace.cli.types import InputFile, OutputFile, OutputFolder
 from raytrace.files import check_output, check_output_folder, shipped
 from raytrace.io import FORMATS, LensFileError, read_lens, shipped_lens
-from raytrace.materials.catalogs import shipped_file
+from raytrace.materials.catalogs import CatalogError, catalog_file
 from raytrace.maths.result import Result
 from raytrace.psf_models import Execution, model_of
 from raytrace.shards import processes, share
@@ -215,15 +215,14 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
 
 def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
     """The glass catalogs of --catalog, files or names of shipped ones. Raises CommandError for a missing one."""
-    paths = []
-    for name in arguments.catalog:
-        path = Path(name)
-        if not (path.suffix or path.exists()):
-            path = shipped_file(name) or path
+    try:
+        paths = tuple(map(catalog_file, arguments.catalog))
+    except CatalogError as error:
+        raise CommandError(f"--catalog {error}") from error
+    for path in paths:
         if not path.is_file():
             raise CommandError(f"{path}: no such glass catalog; expected an .agf file after --catalog")
-        paths.append(path)
-    return tuple(paths)
+    return paths
 
 
 # -- outputs

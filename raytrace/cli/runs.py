@@ -71,10 +71,10 @@ def edit(arguments: argparse.Namespace) -> Result:
     from raytrace.edit.steps import edited  # loads the package of edits
 
     steps = getattr(arguments, "steps", [])
-    if not steps:
+    if not steps and arguments.mount is None:
         raise CommandError("no edit is given, such as --scale 2, --reverse, --delete 3-4")
     try:
-        result = edited(open_lens(arguments), steps)
+        result = edited(open_lens(arguments), steps, arguments.mount)
     except ValueError as error:
         raise CommandError(f"{arguments.lens}: {error}") from error
     with printed_on_failure(result, arguments):

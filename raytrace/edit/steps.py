@@ -11,6 +11,7 @@ from raytrace.edit.surfaces import bend, delete, insert, join, rename, split
 from raytrace.edit.turning import reverse
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table, number
+from raytrace.system.expansion import spaces
 from raytrace.system.lens import Lens
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import option
@@ -27,7 +28,7 @@ class Edited(Result):
     lens: Lens
 
     def figures(self, lens: Lens) -> dict[str, float]:
-        """Effective focal length and track from surface 1 to the image in mm, F/#, count of surfaces, and stop."""
+        """Effective focal length and track from surface 1 to the image in mm, F/#, surfaces, stop, configurations."""
         data, z, places = first_order(lens), 0.0, [0.0]
         for surface in lens.surfaces[1:-1]:
             z += float(surface.thickness)
@@ -38,6 +39,7 @@ class Edited(Result):
             "f_number": float(data.f_number),
             "surfaces": len(lens.surfaces),
             "stop": lens.stop,
+            "configurations": len(lens.configurations),
         }
 
     def document(self) -> dict:
@@ -46,7 +48,7 @@ class Edited(Result):
 
     def tables(self) -> list[Table]:
         before, after = self.figures(self.before), self.figures(self.lens)
-        quantities = ["effective focal length, mm", "total track, mm", "F/#", "surfaces", "stop"]
+        quantities = ["effective focal length, mm", "total track, mm", "F/#", "surfaces", "stop", "configurations"]
         columns: dict[Any, Sequence] = {
             Column("quantity", form="<", heading=" "): quantities,
             Column("before", form=".9g"): [*before.values()],
@@ -55,19 +57,26 @@ class Edited(Result):
         return [Table(columns)]
 
 
-def edited(lens: Lens, steps: Sequence[Step]) -> Edited:
+def edited(lens: Lens, steps: Sequence[Step], mount: str | float | None = None) -> Edited:
     """The lens after edits in their order; surfaces are numbered as the edits before have left them.
 
-    A step "at" chooses the surfaces of the steps behind it that name none. Raises BadEdit.
+    A step "at" chooses the surfaces of the steps behind it that name none. mount: material of all spaces without a
+    stated expansion, when the temperature changes and in the lens after all edits. Raises BadEdit.
     """
     now, chosen = lens, ""
     for name, words in steps:
+        if name == "temperatures":
+            now = _mounted(now, mount)
         if name == "at":
             surfaces_at(now, words)
             chosen = words
         else:
             now = STEPS[name](now, words, chosen)
-    return Edited(lens, now)
+    return Edited(lens, _mounted(now, mount))
+
+
+def _mounted(lens: Lens, mount: str | float | None) -> Lens:
+    return lens if mount is None else lens.at(mount=mount)
 
 
 def _chosen(words: Sequence[str], chosen: str, name: str, further: int = 0) -> tuple[str, list[str], dict[str, Any]]:
@@ -141,6 +150,23 @@ def _semi_diameters(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     return semi_diameters(lens, plain[0] if plain else chosen or None, **given)
 
 
+def _temperatures(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    """Temperatures as configurations: °C …, and materials of single spaces, as 4=invar."""
+    celsius = [_value(word) for word in words if "=" not in word]
+    if not celsius or not all(isinstance(number, float) for number in celsius):
+        raise BadEdit(f"{option('temperatures')} {' '.join(words)}: expected °C, as -20 60, and materials, as 4=invar")
+    for places, _, material in (word.partition("=") for word in words if "=" in word):
+        first, last = surfaces_at(lens, places)
+        known = spaces(lens.surfaces)
+        here = [k for k in known if first <= k <= last]
+        if not here:
+            listed = ", ".join(map(str, known)) or "none"
+            raise BadEdit(f"{places}={material}: no space behind {places}; this lens has spaces behind {listed}")
+        for k in here:
+            lens = lens.replace(k, expansion=material)
+    return lens.with_temperatures([float(number) for number in celsius])
+
+
 def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     surfaces, text = (chosen, words[0]) if len(words) == 1 and chosen else (words[0], " ".join(words[1:]))
     return rename(lens, comments={surfaces: text})
@@ -185,6 +211,7 @@ STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
     "split": _split,
     "bend": _bend,
     "semi_diameters": _semi_diameters,
+    "temperatures": _temperatures,
     "rename": lambda lens, title, chosen: rename(lens, title),
     "comment": _comment,
 }

@@ -142,8 +142,9 @@ def read_lens(
     """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), .roa (ray-optics), or a
     table.
 
-    path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
-    as `raytrace.materials.catalogs.find_glass` does; a catalog that the file names is found in its folder, or in it.
+    path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs, .agf files or
+    names of shipped ones, as ["SCHOTT"], searched as `raytrace.materials.catalogs.find_glass` does; a catalog that the
+    file names is found in its folder, or in it.
     strict: raise where the file holds an unknown keyword or an assumption is needed, instead of one LensFileWarning.
     configuration: of a multi-configuration file, from 1; by default the one that was active when it was saved.
     `lens.configurations` are all of them. substitute: glasses in place of those of the file, each reported in a

@@ -37,7 +37,7 @@ from raytrace.materials.agf import read_agf as read_agf
 from raytrace.materials.agf import read_text
 from raytrace.materials.agf import write_agf as write_agf
 from raytrace.materials.glass import AIR, LINES, MIRROR, Glass, abbe_number, constant, model_glass, nd, refractive_index
-from raytrace.words import RaytraceError, RaytraceWarning, calling_level
+from raytrace.words import RaytraceError, RaytraceWarning, calling_level, did_you_mean
 
 #: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
 #: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
@@ -253,9 +253,23 @@ def same_catalog(a: str, b: str) -> bool:
 
 
 def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
-    """The user's AGF files: those given, then those of the environment variable RAYTRACE_CATALOGS."""
+    """The user's AGF files: those given, then those of the environment variable RAYTRACE_CATALOGS.
+
+    Each is a path, or the name of a shipped catalog. Raises CatalogError for one that is neither.
+    """
     listed = [entry for entry in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if entry.strip()]
-    return tuple(dict.fromkeys(Path(entry) for entry in (*user, *listed)))
+    return tuple(dict.fromkeys(map(catalog_file, (*user, *listed))))
+
+
+def catalog_file(name: str | PathLike) -> Path:
+    """The AGF file of a path, or of the name of a shipped catalog. Raises CatalogError for a name that is neither."""
+    path = Path(name)
+    file = path if path.is_file() else shipped_file(str(name)) or path
+    if not (file.suffix or file.exists()):
+        shipped = f"the name of a shipped one: {', '.join(SHIPPED)}"
+        meant = did_you_mean(path.name, SHIPPED)
+        raise CatalogError(f"{name}: no such glass catalog; expected an AGF file, or {shipped}{meant}")
+    return file
 
 
 def shipped_folder() -> Path:

@@ -126,9 +126,9 @@ def glass(
 ) -> GlassFigures:
     """Properties of a glass by its name, as in a lens file, or by a six-digit MIL code.
 
-    wavelengths: µm, by default the lines F, d and C; catalogs: AGF files, searched first; temperature: °C, pressure:
-    atm: if either is given (defaults 20 °C, 1 atm), indices and wavelengths refer to air in that state; n_d and V_d
-    remain those of the catalog.
+    wavelengths: µm, by default the lines F, d and C; catalogs: AGF files or names of shipped ones, searched first;
+    temperature: °C, pressure: atm: if either is given (defaults 20 °C, 1 atm), indices and wavelengths refer to air in
+    that state; n_d and V_d remain those of the catalog.
     Raises UnknownGlass, ImplausibleWavelength, InvalidIndex, ValueError; warns OutOfRange, NoThermalCoefficients.
     """
     medium = mil_glass(name) if re.fullmatch(r"\d{6}", name) else find_glass(name, user=catalogs)

@@ -25,11 +25,10 @@ import numpy as np
 from raytrace.materials.mounts import MOUNTS, expansion_of
 from raytrace.optimization.glass_choice import TRIAL_CYCLES, TRIED, expansion
 from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.system.expansion import is_solid
+from raytrace.system.expansion import spaces
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import BadVariables, counted, joined
-from raytrace.system.surface import medium_surfaces
 from raytrace.words import option
 
 _ROUNDS = 6
@@ -68,12 +67,6 @@ class SpacerStep:
         return {"spacers": spacers, "predicted": self.predicted, "reached": self.reached, "tried": tried}
 
 
-def spaces_of(lens: Lens) -> list[int]:
-    """The surfaces in front of spaces that have a spacer."""
-    media = medium_surfaces(lens.surfaces)
-    return [k for k in range(1, len(media) - 1) if not is_solid(lens.surfaces[media[k]].glass)]
-
-
 def without_spacers(
     lens: Lens, vary: str | Sequence[str | Vary] | None
 ) -> tuple[str | Sequence[str | Vary] | None, list[tuple[int, ...]]]:
@@ -82,14 +75,14 @@ def without_spacers(
     mine = [word for word in words if isinstance(word, str) and re.fullmatch(r"(spacer|barrel)(:.*)?", word)]
     if not mine:
         return vary, []
-    known, groups = spaces_of(lens), list[tuple[int, ...]]()
+    known, groups = spaces(lens.surfaces), list[tuple[int, ...]]()
     for word in mine:
         kind, _, places = str(word).partition(":")
         listed = counted(str(word), places) if places else known
         for k in listed:
             if k not in known:
-                spaces = ", ".join(map(str, known)) or "none"
-                raise BadVariables(f"{word!r}: no spacer behind surface {k}; this lens has spaces behind {spaces}")
+                behind = ", ".join(map(str, known)) or "none"
+                raise BadVariables(f"{word!r}: no spacer behind surface {k}; this lens has spaces behind {behind}")
         groups += [tuple(listed)] if kind == "barrel" else [(k,) for k in listed]
     twice = sorted(k for k, count in _counts(groups).items() if count > 1)
     if twice:
@@ -99,7 +92,7 @@ def without_spacers(
     if still := [k for group in groups for k in group if k not in warm]:
         raise BadVariables(
             f"{mine[0]!r}: the thickness behind surface {still[0]} has one temperature, at which its spacer does not "
-            "matter; give the lens others by lens.with_temperatures([-20, 60]), or thermal pickups in its file"
+            "matter; give the lens others by lens.with_temperatures([-20, 60]) or raytrace edit --temperatures -20 60"
         )
     return [word for word in words if word not in mine] or None, groups
 

@@ -163,7 +163,9 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
 def at_temperatures(lens: Whole, warm: Sequence[Whole]) -> Whole:
     """The lens, and the lens expanded at other temperatures, as configurations: see `Lens.with_temperatures`."""
     if lens.operands:
-        raise ValueError(f"a lens of {count(lens.operands)} configurations; expected one: take `lens.configuration(1)`")
+        raise ValueError(
+            f"the lens has {count(lens.operands)} configurations; temperatures become those of a lens that has one"
+        )
     data = lens.optimization_data or OptimizationData()
     solved = {solve.address for solve in data.solves}
     numbers: list[tuple[str, int, int, str, Path]] = []

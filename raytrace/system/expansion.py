@@ -43,6 +43,12 @@ def is_solid(glass: Glass) -> bool:
     return not is_air(glass) and held != (1.0,)
 
 
+def spaces(surfaces: Sequence[Surface]) -> list[int]:
+    """The surfaces from 1 in front of spaces, which have a spacer or the mount between the elements."""
+    media = medium_surfaces(surfaces)
+    return [k for k in range(1, len(media) - 1) if not is_solid(surfaces[media[k]].glass)]
+
+
 def unexpanded(surfaces: Sequence[Surface]) -> dict[int, str]:
     """The names of media without an expansion, listed or stated, by the first surface of each."""
     names: dict[str, int] = {}
@@ -55,8 +61,7 @@ def unexpanded(surfaces: Sequence[Surface]) -> dict[int, str]:
 
 def in_contact(surfaces: Sequence[Surface]) -> list[int]:
     """The surfaces from 1 that end a space and are curved: the thickness of the space depends on their edges."""
-    media = [surfaces[k].glass for k in medium_surfaces(surfaces)]
-    ends = {j for k in range(1, len(surfaces) - 1) if not is_solid(media[k]) for j in (k, k + 1)}
+    ends = {j for k in spaces(surfaces) for j in (k, k + 1)}
     return [k for k in sorted(ends) if not (surfaces[k].is_plane or surfaces[k].is_break)]
 
 

@@ -28,7 +28,7 @@ from raytrace.maths.result import point_text
 from raytrace.system import configurations as multiple
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, ScaledPath
-from raytrace.system.expansion import expanded, growth, in_contact, is_solid, unexpanded
+from raytrace.system.expansion import expanded, growth, in_contact, spaces, unexpanded
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import KINDS
@@ -348,6 +348,9 @@ _ELSEWHERE = {
     ),
     **dict.fromkeys(("efl", "focal_length", "effective_focal_length"), "; rt.first_order(lens).effective_focal_length"),
     "f_number": "; rt.first_order(lens).f_number",
+    **dict.fromkeys(("save", "write", "export", "to_file", "to_zmx"), "; rt.write_lens(lens, path) writes its file"),
+    "plot": "; rt.layout(lens).plot(path) draws it",
+    **{name: f"; rt.{name}(lens)" for name in ("info", "layout", "draw", "trace", "spot", "mtf", "psf", "optimize")},
 }
 
 
@@ -535,16 +538,20 @@ class Lens:
         return lens
 
     def with_temperatures(self, temperatures: Sequence[float], *, mount: str | float | None = None) -> "Lens":
-        """The lens with configurations: the first as it is, then one for each of these temperatures, °C.
+        """The lens with configurations: the first as it is, then one for each of these temperatures, °C, but its own.
 
         Operands TEMP, CRVT, THIC, PRAM and SDIA hold its numbers, as OpticStudio's thermal pickups: in an optimisation
         those of the first configuration vary, and the others follow by expansion. Solved numbers stay solved in every
         configuration. Semi-diameters become fixed: there the spacers have contact. mount: as of `at`. Raises ValueError
-        for a lens with configurations, and for surfaces other than conics and even aspheres.
+        for a lens with configurations, surfaces other than conics and even aspheres, and no other temperature.
         """
         from raytrace.tracing.geometry import contact_heights
 
         lens = with_environment(self if mount is None else with_mount(self, mount), None, None)
+        others = [celsius for celsius in temperatures if not _is_at(lens, celsius)]
+        if not others:
+            reference = f"{temperature_of(lens):g} °C, that of the lens"
+            raise ValueError(f"{option('temperatures')} {[*temperatures]}: expected one other than {reference}")
         heights = contact_heights(lens, in_contact(lens.surfaces))
         sizes = {k: float(height.detach()) or None for k, height in heights.items()}
         surfaces = tuple(
@@ -552,7 +559,7 @@ class Lens:
         )
         lens = dataclasses.replace(lens, surfaces=surfaces)
         lens = lens.with_semi_diameters()  # stored automatic ones may be those of another design
-        return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in temperatures])
+        return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in others])
 
     def with_semi_diameters(
         self, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
@@ -755,13 +762,11 @@ def with_mount(lens: Lens, mount: str | float) -> Lens:
 
     A stated `Surface.expansion` stays. Raises ValueError for an unknown material.
     """
-    expansion, media = _like(expansion_of(mount), lens.wavelengths), medium_surfaces(lens.surfaces)
-
-    def mounted(k: int, surface: Surface) -> Surface:
-        is_spacer = 0 < k < len(media) - 1 and not is_solid(lens.surfaces[media[k]].glass)
-        return dataclasses.replace(surface, expansion=expansion) if is_spacer and surface.expansion is None else surface
-
-    return dataclasses.replace(lens, surfaces=tuple(mounted(k, surface) for k, surface in enumerate(lens.surfaces)))
+    expansion, surfaces = _like(expansion_of(mount), lens.wavelengths), [*lens.surfaces]
+    for k in spaces(surfaces):
+        if surfaces[k].expansion is None:
+            surfaces[k] = dataclasses.replace(surfaces[k], expansion=expansion)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def temperature_of(lens: Lens) -> Tensor:

@@ -192,6 +192,9 @@ def tolerances(
     if grade is not None and grade not in GRADES:
         raise BadTolerance(f"grade {grade!r}{did_you_mean(grade, GRADES)}: expected one of {', '.join(GRADES)}")
     words = parsed_limits(limits)
+    if radial and not (grade or words):
+        given = f"{option('grade')} or {option('limits')}"
+        raise BadTolerance(f"{option('radial')} goes with {given}: tolerances of a file keep their own directions")
     stored = tolerances_of(lens) if grade is None else ToleranceTable(())
     if not (grade or words or stored.rows):
         limits_or_grade = f'{option("limits")}, as "radius=0.1%", or {option("grade")}, as "precision"'

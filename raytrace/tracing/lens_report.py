@@ -28,7 +28,7 @@ from raytrace.tracing.geometry import (
     warn_of_defects,
 )
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.paraxial import LINES, at_infinity, first_order, telecentric_spaces
+from raytrace.tracing.paraxial import LINES, first_order, quantity_remark, quantity_text
 from raytrace.tracing.trace import aiming_of
 
 #: Descriptions of phases and sag terms with their numbers; others are described by their class alone.
@@ -160,7 +160,7 @@ class Info(Result):
         lens = detached(self.lens)
         indices, geometry = media(lens, lens.wavelengths), [defect.document() for defect in defects(lens)]
         sizes, fixed = semi_diameters(lens), fixed_semi_diameters(lens)
-        widths = mechanical_semi_diameters(lens, sizes)
+        widths, data = mechanical_semi_diameters(lens, sizes), first_order(lens)
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
@@ -168,8 +168,8 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
-            "telecentric": telecentric_spaces(lens),
-            "afocal": "effective_focal_length" in at_infinity(lens),
+            "telecentric": data.telecentric_spaces,
+            "afocal": "effective_focal_length" in data.infinite(),
             "ray_aiming": lens.ray_aiming,
             "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
@@ -210,12 +210,12 @@ class Info(Result):
     def quantities(self) -> list[tuple[str, str, str]]:
         """First-order data: quantity, value, and unit or definition."""
         lens = detached(self.lens)
-        infinite, lines = at_infinity(lens), []
-        for (words, name, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
-            is_computed = name in infinite and math.isfinite(figure)
-            remark = f"; {figure:.4g} mm by first-order data" if is_computed else ""
-            lines.append((words, infinite.get(name, _quantity(figure)), unit + remark))
-        return lines
+        infinite = first_order(lens).infinite()
+        rows = ((*line, infinite.get(line[1])) for line in FIRST_ORDER_LINES)
+        return [
+            (words, quantity_text(figure, word), unit + quantity_remark(figure, word))
+            for (words, _, unit, word), figure in zip(rows, _figures(lens), strict=True)
+        ]
 
     def base_ray_quantities(self) -> list[tuple[str, str, str, str]]:
         """Data about the axial chief ray of a lens whose axis bends or whose sections differ: quantity, tangential,
@@ -223,10 +223,10 @@ class Info(Result):
         lens = detached(self.lens)
         if is_round_about_axis(lens) or not bool((base := base_ray(lens)).valid):  # the sections agree in the former
             return []
-        infinite = at_infinity(lens)
+        infinite = first_order(lens).infinite()
         infinite |= {"focal_length": infinite["effective_focal_length"]} if "effective_focal_length" in infinite else {}
         pairs = [
-            (words, [infinite.get(name, _quantity(figure)) for figure in getattr(base, name).tolist()], unit)
+            (words, [quantity_text(figure, infinite.get(name)) for figure in getattr(base, name).tolist()], unit)
             for words, name, unit in BASE_RAY_LINES
         ]
         return [(words, tangential, sagittal, unit) for words, (tangential, sagittal), unit in pairs]
@@ -235,7 +235,7 @@ class Info(Result):
         """Wavelengths, fields, ray aiming, configuration and environment: quantity and text."""
         lens = detached(self.lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
-        several, which = len(lens.wavelengths) > 1, _configuration(lens)
+        several, which, spaces = len(lens.wavelengths) > 1, _configuration(lens), first_order(lens).telecentric_spaces
         aiming = lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
         shown = ", ".join(
             f"{w:g}" + ("*" if i == lens.primary_wavelength - 1 and several else "")
@@ -244,7 +244,7 @@ class Info(Result):
         primary = f"  (* primary: number {lens.primary_wavelength})" if several else ""
         return [
             ("wavelengths", f"{shown} µm{primary}"),
-            *([("telecentric", f"in {' and '.join(spaces)} space")] if (spaces := telecentric_spaces(lens)) else []),
+            *([("telecentric", f"in {' and '.join(spaces)} space")] if spaces else []),
             ("ray aiming", aiming),
             *([("configuration", " of ".join(map(str, which.values())))] if which else []),
             ("fields", f"{points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}"),
@@ -313,12 +313,6 @@ def _environment(holder: Lens | Surface) -> dict:
 
 def _indices(lens: Lens) -> list[float]:
     return [float(index) for index in media(lens, lens.primary)]
-
-
-def _quantity(value: float) -> str:
-    if math.isnan(value):
-        return "-"
-    return "infinite" if math.isinf(value) else f"{value + 0.0:.9g}"
 
 
 def _figures(lens: Lens) -> list[float]:

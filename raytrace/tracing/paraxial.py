@@ -5,6 +5,7 @@ A ray is (y, ω) with ω = n u, u = dy/dz the slope and n the *signed* index, ne
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -73,6 +74,8 @@ class FirstOrder(Result):
     object_na, image_na: n sin θ of the paraxial marginal ray.
     petzval_radius: radius of the Petzval surface, signed like a surface's.
     front_principal_plane, rear_principal_plane: from surface 1, and from the last surface before the image.
+    length: of all thicknesses from surface 1 to the image, no column; telecentric: whether the fields are those of a
+        telecentric object space.
     """
 
     power: Tensor
@@ -95,25 +98,73 @@ class FirstOrder(Result):
     petzval_radius: Tensor
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
+    length: Tensor
+    telecentric: bool = False
 
     def columns(self) -> dict[str, Tensor]:
         """A row for each wavelength and lens."""
-        return {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        names = (entry.name for entry in dataclasses.fields(self))
+        return {name: getattr(self, name) for name in names if name not in ("length", "telecentric")}
 
     def column(self, name: str) -> Column:
         unit = next(unit for _, entry, unit in (*LINES, *FURTHER_LINES) if entry == name)
         return Column(name, next((length for length in ("1/mm", "mm") if unit.startswith(length)), ""))
 
+    def infinite(self) -> dict[str, str]:
+        """Entries that are infinite in practice, and the word of it; of several lenses those that are so in all.
+
+        effective_focal_length: "afocal", and focal distances and principal planes "infinite"; entrance_pupil_position:
+        "telecentric", chief rays are parallel in object space; exit_pupil_position: "telecentric", in image space, and
+        its diameter "infinite". Lengths are compared with that of the lens.
+        """
+        limits = {"effective_focal_length": _AFOCAL, "entrance_pupil_position": _FAR, "exit_pupil_position": _FAR}
+        reach = self.length.detach().clamp(min=1.0)
+        far = {name for name, limit in limits.items() if bool((getattr(self, name).abs() > limit * reach).all())}
+        far |= {"entrance_pupil_position"} if self.telecentric else set()
+        words = {name: "telecentric" for name in limits if name in far}
+        if "effective_focal_length" in words:
+            words["effective_focal_length"] = "afocal"
+            lengths = ("back_focal_distance", "front_focal_distance", "front_principal_plane", "rear_principal_plane")
+            words |= dict.fromkeys(lengths, "infinite")
+        if "exit_pupil_position" in words:
+            words["exit_pupil_diameter"] = "infinite"
+        return words
+
+    @property
+    def telecentric_spaces(self) -> list[str]:
+        """The spaces, "object" and "image", in which chief rays are parallel."""
+        spaces = {"entrance_pupil_position": "object", "exit_pupil_position": "image"}
+        return [spaces[name] for name in self.infinite() if name in spaces]
+
     def tables(self) -> list[Table]:
         """A line for each quantity: its number, of several lenses or wavelengths the least and the largest."""
-        figures = flat(self.columns())
+        figures, infinite = flat(self.columns()), self.infinite()
         lines, count = (*LINES, *FURTHER_LINES), len(figures["power"])
         ends = {"": min} if count == 1 else {"least": min, "largest": max}
         printed: dict = {Column("quantity", form="<", heading=" "): [words for words, *_ in lines]}
         for name, end in ends.items():
-            printed[Column(name, form=".9g")] = [end(figures[entry]) for _, entry, _ in lines]
-        printed[Column("unit", form="<", heading=" ")] = [unit for *_, unit in lines]
+            texts = (quantity_text(end(figures[entry]), infinite.get(entry)) for _, entry, _ in lines)
+            printed[Column(name, form=">")] = [*texts]
+        computed = {entry: figures[entry][0] if count == 1 else math.inf for _, entry, _ in lines}
+        units = [unit + quantity_remark(computed[entry], infinite.get(entry)) for _, entry, unit in lines]
+        printed[Column("unit", form="<", heading=" ")] = units
         return [Table(printed, [f"first-order data of {count} lenses or wavelengths"] if count > 1 else ())]
+
+
+#: Pupils so many lengths of the lens away are at infinity, and focal lengths so many are those of an afocal lens.
+_FAR, _AFOCAL = 1e3, 1e4
+
+
+def quantity_text(figure: float, word: str | None = None) -> str:
+    """A number of first-order data as it is printed; word: of one that is infinite in practice."""
+    if word:
+        return word
+    return "-" if math.isnan(figure) else "infinite" if math.isinf(figure) else f"{figure + 0.0:.9g}"
+
+
+def quantity_remark(figure: float, word: str | None = None) -> str:
+    """The number of a quantity that is infinite in practice, behind its unit."""
+    return f"; {figure:.4g} mm by first-order data" if word and math.isfinite(figure) else ""
 
 
 def brackets(powers: Sequence[Number], gaps: Sequence[Number]) -> Matrix:
@@ -391,6 +442,8 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         petzval_radius=-1 / (n_image * petzval),
         front_principal_plane=n_object * (D - 1) / C,
         rear_principal_plane=n_image * (1 - A) / C,
+        length=sum((surface.thickness.abs() for surface in surfaces), torch.zeros_like(n_object)),
+        telecentric=lens.fields.telecentric,
     )
 
 
@@ -456,35 +509,6 @@ def at_magnification(lens: Lens, magnification: Tensor | float, *, keep_sensor: 
     shape = () if lens.count is None else (-1,)
     lens = with_object_distance(lens, distance.reshape(shape))
     return lens if keep_sensor else with_sensor_distance(lens, image.reshape(shape))
-
-
-#: Pupils so many lengths of the lens away are at infinity, and focal lengths so many are those of an afocal lens.
-_FAR, _AFOCAL = 1e3, 1e4
-
-
-def at_infinity(lens: Lens) -> dict[str, str]:
-    """Entries of FirstOrder that are infinite in practice, and the word of it.
-
-    effective_focal_length: "afocal", and both focal distances "infinite"; entrance_pupil_position: "telecentric", chief
-    rays are parallel in object space; exit_pupil_position: "telecentric", in image space. Lengths are compared with
-    that of the lens, object to image without the object distance.
-    """
-    data = first_order(lens)
-    length = max(sum(abs(float(surface.thickness.detach())) for surface in lens.surfaces[1:-1]), 1.0)
-    limits = {"effective_focal_length": _AFOCAL, "entrance_pupil_position": _FAR, "exit_pupil_position": _FAR}
-    far = {name for name, limit in limits.items() if abs(float(getattr(data, name).detach())) > limit * length}
-    far |= {"entrance_pupil_position"} if lens.fields.telecentric else set()
-    words = {name: "telecentric" for name in limits if name in far}
-    if "effective_focal_length" in words:
-        words["effective_focal_length"] = "afocal"
-        words |= {"back_focal_distance": "infinite", "front_focal_distance": "infinite"}
-    return words
-
-
-def telecentric_spaces(lens: Lens) -> list[str]:
-    """The spaces, "object" and "image", in which chief rays are parallel."""
-    spaces = {"entrance_pupil_position": "object", "exit_pupil_position": "image"}
-    return [spaces[name] for name in at_infinity(lens) if name in spaces]
 
 
 def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:

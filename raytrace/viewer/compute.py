@@ -31,9 +31,9 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, computed_once, field_label, field_points, shared
 from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.tracing.f_number import working_f_number
-from raytrace.tracing.geometry import defects, semi_diameters
+from raytrace.tracing.geometry import defects, fixed_semi_diameters, mechanical_semi_diameters, semi_diameters
 from raytrace.tracing.launch import unfilled
-from raytrace.tracing.paraxial import at_infinity, first_order
+from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
 from raytrace.viewer.state import State, has_merit, shown_fields, slider_ends, word_of
 
@@ -172,7 +172,8 @@ def mtf_of(lens: Lens, fields: Tensor, highest: float, *, diffraction: bool = Fa
 
 def first_order_of(lens: Lens) -> list[dict]:
     """First-order data and the working F/#: name, value and unit; words of a value that is infinite in practice."""
-    data, infinite = first_order(lens), at_infinity(lens)
+    data = first_order(lens)
+    infinite = data.infinite()
     names = {"EFL": "effective_focal_length", "entrance pupil": "entrance_pupil_position",
         "exit pupil": "exit_pupil_position"}  # fmt: skip
     rows = (
@@ -277,6 +278,7 @@ def prescription(state: State) -> dict:
     data = lens.optimization_data
     follows = {word_of(solve) for solve in (data.solves if data else ())}
     rows, last, sizes = [], len(lens.surfaces) - 1, semi_diameters(lens)
+    widths, fixed = mechanical_semi_diameters(lens, sizes), fixed_semi_diameters(lens)
     for k, surface in enumerate(lens.surfaces):
         numbers = {} if k == last else {"thickness": surface.thickness}
         if k > 0:
@@ -295,6 +297,12 @@ def prescription(state: State) -> dict:
                 },
                 "glass": None if k == last or surface.is_break else label(surface.glass),
                 "semi_diameter": plain(sizes[k]),
+                "chip_zone": surface.chip_zone or 0.0,
+                "mechanical_semi_diameter": plain(widths[k]),
+                "fixed": [
+                    *(["semi_diameter"] if k in fixed else []),
+                    *(["mechanical_semi_diameter"] if surface.mechanical_semi_diameter else []),
+                ],
                 "comment": surface.comment,
                 "stop": k == lens.stop,
                 "vary": sorted(here[0]),

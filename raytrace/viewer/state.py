@@ -29,7 +29,8 @@ from raytrace.system.configurations import freed, kept
 from raytrace.system.lens import Fields, Lens, SystemAperture, check, field_points
 from raytrace.system.optimization_data import Row, Solve, Vary
 from raytrace.system.parameter_paths import modelled, parameter_paths, path_of, with_number
-from raytrace.tracing.geometry import gaps
+from raytrace.system.surface import SIZES
+from raytrace.tracing.geometry import gaps, semi_diameters
 from raytrace.tracing.launch import factors_at
 from raytrace.tracing.paraxial import first_order
 from raytrace.words import named_value
@@ -262,11 +263,17 @@ def with_value(lens: Lens, surface: int, quantity: str, text: object) -> Lens:
         raise ValueError(f"{what}: this lens has surfaces 0 to {len(lens.surfaces) - 1}")
     if quantity == "glass":
         lens = lens.replace(surface, glass=str(text))
-    elif quantity == "semi_diameter":
+    elif quantity in SIZES:
         size = number(text, what) if str(text).strip() else None
         if size is not None and not 0 <= size < math.inf:
             raise ValueError(f"{what}: found {size:g}; expected mm, 0 or more")
-        lens = lens.replace(surface, semi_diameter=size)
+        lens = lens.replace(surface, **{quantity: size or (size if quantity == "semi_diameter" else None)})
+        width, clear = lens.surfaces[surface].mechanical_semi_diameter, semi_diameters(lens)[surface]
+        if width is not None and width < clear:
+            raise ValueError(
+                f"surface {surface}: the mechanical semi-diameter of {width:.6g} mm is smaller than the clear one, "
+                f"{clear:.6g} mm"
+            )
     else:
         given = number(text, what)
         if quantity == "radius":

@@ -14,7 +14,10 @@ A dash: the lens has no such tolerance.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from raytrace.system.lens import Lens
 from raytrace.system.tolerance_data import Tolerance
+from raytrace.tolerancing.files import tolerances_of
+from raytrace.tolerancing.grades import tolerances
 from raytrace.tolerancing.table import ToleranceTable
 from raytrace.words import RaytraceError
 from raytrace.workshop.parts import Face, Part
@@ -60,6 +63,28 @@ def limits(row: Tolerance | None, factor: float = 1.0, unit: str = "", digits: i
     return f"{text}{unit}".replace("-", "−")
 
 
+def sized(length: float, decimals: int = 4) -> str:
+    """A length in mm, without zeros at its end."""
+    return f"{length:.{decimals}f}".rstrip("0").rstrip(".")
+
+
+def toleranced(length: float, row: Tolerance | None, factor: float = 1.0) -> str:
+    """A length in mm to a tenth of its tolerance, from 0.01 to 0.0001 mm, and the limits, times a factor in mm.
+
+    "8.747 ± 0.02"; without a tolerance the length to 0.001 mm.
+    """
+    least = min((abs(factor * end) for end in (row.minimum, row.maximum) if end), default=None) if row else None
+    decimals = 3 if least is None else min(max(1 - math.floor(math.log10(least) + 1e-9), 2), 4)
+    return f"{sized(length, decimals)} {limits(row, factor)}".rstrip()
+
+
+def tolerances_for(lens: Lens, limits: str | Sequence[str], *, grade: str | None, radial: bool) -> ToleranceTable:
+    """The tolerances of a document: of a grade and of limits, as of `tolerances`, else those of the lens, or none."""
+    if grade or limits or radial:
+        return tolerances(lens, limits, grade=grade, radial=radial)
+    return tolerances_of(lens)
+
+
 class Indications:
     """The tolerances of a lens by their place on the sheets; words: further indications, as of `stated`."""
 
@@ -78,12 +103,13 @@ class Indications:
             return "R ∞"
         radius, k = 1 / face.curvature, face.number
         percent, curvature = self.row("radius", k), self.row("curvature", k)
-        error = ""
+        row, factor = percent or curvature, radius**2
+        if row is None:
+            return f"R {abs(radius):.6g} {side}"
         if percent is not None:
-            error = limits(percent, abs(radius) / 100 if percent.unit == "%" else 1.0)
-        elif curvature is not None:
-            error = limits(curvature, radius**2)
-        return f"R {abs(radius):.7g} {side} {error}".rstrip()
+            factor = abs(radius) / 100 if percent.unit == "%" else 1.0
+        size, _, error = toleranced(abs(radius), row, factor).partition(" ")
+        return f"R {size} {side} {error}".rstrip()
 
     def form(self, face: Face) -> str:
         """3/A(B): power and irregularity in fringes of 546.07 nm."""

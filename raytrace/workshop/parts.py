@@ -4,6 +4,7 @@ A profile is a closed line in the half plane (z, r) of a part, of mm from the ve
 direction of the light. Spheres, planes and cones are exact; other sags become B-splines, whose deviation is known.
 A face follows its sag up to its clear semi-diameter and chip zone; beyond, a convex conic and a cemented face follow it
 to the edge of the part, other faces are flat, as all faces in air of a part of fixed mechanical semi-diameter are.
+Clear diameters, and mechanical ones that are not fixed, are rounded up to `DIAMETER_STEP`, in drawings and solids.
 """
 
 import dataclasses
@@ -34,6 +35,9 @@ from raytrace.words import RaytraceError, option
 
 #: Largest deviation in mm of the B-spline of a sag: 1 nm.
 DEVIATION = 1e-6
+
+#: mm of clear and mechanical diameters, a tenth of it below 1 mm.
+DIAMETER_STEP = 0.01
 
 _NODES = 200  # of the volume, between two corners of a profile
 _DEGREE, _MOST_INTERVALS, _CHECKED = 5, 1024, 4001
@@ -198,6 +202,23 @@ def _along(face: Face, hole: float, rim: float, chamfer: float, sign: int) -> li
     return result
 
 
+def _outward(semi_diameter: float, limit: float = math.inf) -> float:
+    """mm, half the diameter rounded up to its step; as it is where that exceeds a limit."""
+    step = 0.5 * (DIAMETER_STEP if semi_diameter >= 0.5 else 0.1 * DIAMETER_STEP)
+    if not math.isfinite(semi_diameter):
+        return semi_diameter
+    rounded = round(math.ceil(semi_diameter / step - 1e-6) * step, 9)
+    return rounded if rounded <= limit else semi_diameter
+
+
+def _clear(lens: Lens) -> list[float]:
+    """mm, the clear semi-diameters of the drawings, within the surface and a fixed mechanical one."""
+    return [
+        _outward(size, min(surface.mechanical_semi_diameter or math.inf, 0.9999 * edge_radius(surface)))
+        for size, surface in zip(semi_diameters(lens), lens.surfaces, strict=True)
+    ]
+
+
 @torch.no_grad()
 def parts_of(lens: Lens, *, margin: float = 0.0, chamfer: float = 0.0, substrate: float | None = None) -> list[Part]:
     """The elements and mirrors of a lens.
@@ -207,7 +228,7 @@ def parts_of(lens: Lens, *, margin: float = 0.0, chamfer: float = 0.0, substrate
     sixth of their diameter. Raises NoSolid for margins and chamfers that do not fit.
     """
     lens = detached(lens)
-    clear, elements, direction = semi_diameters(lens), lens_elements(lens), sides(lens)
+    clear, elements, direction = _clear(lens), lens_elements(lens), sides(lens)
     groups = cemented_groups(lens)
     polished, widths = polished_semi_diameters(lens, clear), mechanical_semi_diameters(lens, clear)
     result = []
@@ -219,12 +240,14 @@ def parts_of(lens: Lens, *, margin: float = 0.0, chamfer: float = 0.0, substrate
             glass = lens.surfaces[first].glass
             result.append(Part(name, (first, last), (), glass, math.nan, math.nan, objection=objection))
         elif first == last:
-            more = 0.0 if lens.surfaces[first].mechanical_semi_diameter else margin
-            result.append(_mirror(lens, name, first, side, clear[first], widths[first] + more, substrate))
+            fixed = lens.surfaces[first].mechanical_semi_diameter
+            width = fixed or _outward(widths[first] + margin)
+            result.append(_mirror(lens, name, first, side, clear[first], width, substrate))
         else:
             whole = next(((a, b) for a, b in groups if a <= first and back <= b), (first, back))
-            is_fixed = any(surface.mechanical_semi_diameter for surface in lens.surfaces[whole[0] : whole[1] + 1])
-            rim = max(widths[first], widths[back]) + (0.0 if is_fixed else margin)
+            fixed_sizes = [surface.mechanical_semi_diameter for surface in lens.surfaces[whole[0] : whole[1] + 1]]
+            rim, is_fixed = max(widths[first], widths[back]), any(fixed_sizes)
+            rim = rim if rim in fixed_sizes else _outward(rim + (0.0 if is_fixed else margin))
             for k in (first, back):
                 if rim < clear[k]:
                     raise NoSolid(

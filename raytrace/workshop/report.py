@@ -40,8 +40,6 @@ from raytrace.settings import ON_REQUEST, REPORTS, SECTIONS
 from raytrace.system.lens import Lens, field_points, with_wavelengths
 from raytrace.system.shapes import KINDS
 from raytrace.tolerancing.analysis import tolerance as as_built
-from raytrace.tolerancing.files import tolerances_of
-from raytrace.tolerancing.grades import tolerances
 from raytrace.tracing.lens_report import Info, info
 from raytrace.words import RaytraceError, RaytraceWarning, did_you_mean, option
 from raytrace.workshop.document import (
@@ -55,6 +53,7 @@ from raytrace.workshop.document import (
     settled,
     tables_of,
 )
+from raytrace.workshop.indications import tolerances_for
 from raytrace.workshop.pages import pdf
 from raytrace.workshop.sheets import draw
 from raytrace.workshop.web import page
@@ -283,9 +282,8 @@ def _without_conditions(result: Result) -> Result:
 
 
 def _tolerances(request: _Request, writer: _Writer) -> None:
-    grade, limits = request.options["grade"], request.options["limits"]
-    lens = request.lens
-    table = tolerances(lens, limits, grade=grade) if grade or limits else tolerances_of(lens)
+    options = {name: request.options[name] for name in ("grade", "limits", "radial")}
+    grade, table = options["grade"], tolerances_for(request.lens, **options)
     if not len(table):
         raise BadReport(f"The lens stores no tolerances; {option('grade')} adds those of a published grade.")
     if grade:
@@ -295,7 +293,7 @@ def _tolerances(request: _Request, writer: _Writer) -> None:
 
 
 def _as_built(request: _Request, writer: _Writer) -> None:
-    names = ("grade", "limits", "criterion", "trials", "seed", "progress")
+    names = ("grade", "limits", "radial", "criterion", "trials", "seed", "progress")
     options = {name: request.options[name] for name in names}
     writer.analysis("The lens as built", lambda: as_built(request.lens, **options, **request.at_fields))
 
@@ -314,6 +312,7 @@ def _drawings(request: _Request, writer: _Writer) -> None:
         elements=(),
         grade=request.options["grade"],
         limits=request.options["limits"],
+        radial=request.options["radial"],
         date=request.options["date"],
     )
     writer.blocks += [Picture(paper.figure(), paper.title) for paper in sheets.sheets()]
@@ -372,6 +371,7 @@ def report(
     configuration: int | str = "all",
     grade: Literal["commercial", "precision", "high"] | None = None,
     limits: str | Sequence[str] = "",
+    radial: bool = False,
     tolerance: bool = False,
     criterion: str = "rms",
     trials: int = 1000,
@@ -386,11 +386,11 @@ def report(
     only: the names of its sections, of `raytrace.settings.SECTIONS`; without: sections that are left out; also:
     sections in addition to the usual ones. A section that does not apply to the lens gives the reason in a line.
     fields: y or (x, y), by default the lens's own; wavelengths: µm; configuration: a number from 1, or "all".
-    grade, limits: tolerances, as of `tolerances`, by default those of the lens; tolerance: with the lens as built, by
-    `trials` perturbed lenses of `seed` and `criterion`, as of `rt.tolerance`. temperatures: lowest and highest, °C,
-    of a section over temperature, by default -20 and 60 where the lens has a temperature or expansions, else no such
-    section; mount: as of `thermal`. date: of the title, by default today. progress: called with (work, unit), returns
-    the iterable.
+    grade, limits, radial: tolerances, as of `tolerances`, by default those of the lens; tolerance: with the lens as
+    built, by `trials` perturbed lenses of `seed` and `criterion`, as of `rt.tolerance`. temperatures: lowest and
+    highest, °C, of a section over temperature, by default -20 and 60 where the lens has a temperature or expansions,
+    else no such section; mount: as of `thermal`. date: of the title, by default today. progress: called with (work,
+    unit), returns the iterable.
 
     Every number is that of the public function of the section. Raises BadReport for unknown sections, ValueError for
     another suffix.
@@ -410,7 +410,8 @@ def report(
     lenses = tuple(map(detached, lens.configurations)) if configuration == ALL else (lens,)
     date = datetime.date.today().isoformat() if date is None else date
     options = {
-        "grade": grade, "limits": limits, "criterion": criterion, "trials": trials, "seed": seed, "date": date,
+        "grade": grade, "limits": limits, "radial": radial, "criterion": criterion, "trials": trials, "seed": seed,
+        "date": date,
         "temperatures": (-20.0, 60.0) if temperatures is None else temperatures, "mount": mount,
         "progress": None if progress is None else lambda count, unit: progress(count, unit),
     }  # fmt: skip

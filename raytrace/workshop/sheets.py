@@ -27,12 +27,10 @@ from raytrace.settings import DRAWINGS
 from raytrace.system.elements import cemented_groups
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.tolerancing.files import tolerances_of
-from raytrace.tolerancing.grades import tolerances
 from raytrace.tracing.lens_report import remarks
 from raytrace.words import option
 from raytrace.workshop import dxf, step
-from raytrace.workshop.indications import Indications, limits, stated
+from raytrace.workshop.indications import Indications, limits, sized, stated, toleranced, tolerances_for
 from raytrace.workshop.paper import HEIGHT, MARGIN, WIDTH, Paper, scale_for, scale_text
 from raytrace.workshop.parts import Face, Part, parts_of
 
@@ -154,6 +152,7 @@ def draw(
     elements: Sequence[int] | None = None,
     grade: str | None = None,
     limits: str | Sequence[str] = "",
+    radial: bool = False,
     indications: str | Sequence[str] = "",
     coating: str = "",
     margin: float = 0.0,
@@ -165,8 +164,8 @@ def draw(
 
     elements: numbers of the elements with a sheet of their own, from 1 in the order of the light, without the sheet of
     the whole lens; (): all of them and the whole lens; None: the whole lens alone.
-    grade, limits: tolerances, as of `tolerances`, by default those of the lens. indications: further ones of all parts,
-    "0/20 1/3x0.16 2/1;1 5/5x0.25 6/-"; coating: of all surfaces in air. What is not specified is a dash.
+    grade, limits, radial: tolerances, as of `tolerances`, by default those of the lens. indications: further ones of
+    all parts, "0/20 1/3x0.16 2/1;1 5/5x0.25 6/-"; coating: of all surfaces in air. What is not specified is a dash.
     margin: mm added to mechanical semi-diameters that are not fixed; chamfer: mm of both legs, at 45°; substrate:
     thickness in mm of mirrors, by default a sixth of their diameter; date: of the title block. `save` writes .pdf,
     .svg, .png, .dxf or .step. Raises ValueError, NoSolid, BadTolerance, BadIndication.
@@ -191,7 +190,7 @@ def draw(
         tuple(part.name for part in parts if first <= part.surfaces[0] and part.surfaces[1] <= last)
         for first, last in cemented_groups(lens)
     )
-    table = tolerances(lens, limits, grade=grade) if grade or limits else tolerances_of(lens)
+    table = tolerances_for(lens, limits, grade=grade, radial=radial)
     chosen = () if elements is None else tuple(map(str, elements)) if elements else tuple(names)
     words = Indications(table, stated(indications), coating)
     return Drawings(lens, tuple(parts), groups, chosen, not elements, words, date)
@@ -270,18 +269,21 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
     for part, end, x, offset in ends[: 1 if parts[-1].is_mirror else 2]:
         height = min(part.faces[end].clear, part.rim)
         rim_end = start + scale * (float(part.ends(np.array([height]))[end][0]) + offset)
-        paper.up(x, axis - scale * height, axis + scale * height, rim_end, f"⌀e {2 * height:.6g}")
+        paper.up(x, axis - scale * height, axis + scale * height, rim_end, f"⌀e {sized(2 * height)}")
     widest = max(parts, key=lambda part: part.rim)
     z_rim = offsets[parts.index(widest)] + widest.ends(np.array([widest.rim]))[1][0]
-    paper.up(right_end + 22, axis - scale * rim, axis + scale * rim, start + scale * float(z_rim), f"⌀ {2 * rim:.6g}")
+    paper.up(
+        right_end + 22, axis - scale * rim, axis + scale * rim, start + scale * float(z_rim), f"⌀ {sized(2 * rim)}"
+    )
     bottom = axis - scale * rim - 9
     first = parts[0].surfaces[0]
     row = given.row("thickness", first) if len(parts) == 1 else None
-    paper.across(start, start + scale * thick, bottom, (axis, axis), f"{thick:.6g} {limits(row)}".rstrip())
+    size = toleranced(thick, row) if len(parts) == 1 else _total(given, parts)
+    paper.across(start, start + scale * thick, bottom, (axis, axis), size)
     if len(parts) == 1:
         start_of_edge, end_of_edge = (start + scale * float(z[0]) for z in widest.ends(np.array([widest.rim])))
         top = axis + scale * rim
-        paper.across(start_of_edge, end_of_edge, top + 7, (top, top), f"({widest.edge:.4g})")
+        paper.across(start_of_edge, end_of_edge, top + 7, (top, top), f"({sized(widest.edge, 2)})")
 
     _table_of_faces(paper, drawings, parts)
     for k, face in enumerate(aspheric):
@@ -290,6 +292,12 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
         paper.fitted(MARGIN + 2, _FOOT + 3 + 3.4 * (len(lines) - 1 - k), line, right - MARGIN - 4, 6)
     _title_block(paper, drawings, name, scale, (_SPLIT, _FOOT))
     return paper
+
+
+def _total(given: Indications, parts: Sequence[Part]) -> str:
+    """Thickness of a cemented group in mm, the sum of those of its elements as they are printed."""
+    rows = ((part.thickness, given.row("thickness", part.surfaces[0])) for part in parts)
+    return sized(sum(float(toleranced(size, row).split()[0]) for size, row in rows))
 
 
 def _table_of_faces(paper: Paper, drawings: Drawings, parts: Sequence[Part]) -> None:
@@ -320,7 +328,7 @@ def _column(drawings: Drawings, face: Face, part: Part, outward: int) -> list[st
     chamfer = part.chamfers[0 if outward < 0 else 1]
     return [
         f"{given.radius(face, side)}{kind}",
-        f"⌀e {2 * face.clear:.6g}",
+        f"⌀e {sized(2 * face.clear)}",
         f"Prot. chamfer {chamfer:g} × 45°" if chamfer else "Prot. chamfer –",
         "cemented" if face.is_cemented else f"λ {given.coating}" if given.coating else "λ –",
         given.form(face),
@@ -336,7 +344,7 @@ def _material(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
     if len(parts) > 1:
         shift, tilt = given.mounting(parts[0].surfaces[0], parts[-1].surfaces[1])
         cells = [
-            f"{p.name}: {label(p.glass)}, {p.thickness:.6g} {limits(given.row('thickness', p.surfaces[0]))}"
+            f"{p.name}: {label(p.glass)}, {toleranced(p.thickness, given.row('thickness', p.surfaces[0]))}"
             for p in parts
         ]
         cells = [*cells[:4], "; ".join(cells[4:])] if len(cells) > 5 else [*cells, *[""] * (5 - len(cells))]
@@ -374,8 +382,8 @@ def _lines(drawings: Drawings, parts: Sequence[Part]) -> list[str]:
     front, back = parts[0].faces[0], parts[-1].faces[1]
     heads = (f"LEFT SURFACE{_number(front)}", "MATERIAL", f"RIGHT SURFACE{_number(back)}")
     cells = (_column(drawings, front, parts[0], -1), _material(drawings, parts), _column(drawings, back, parts[-1], 1))
-    sizes = f"thickness {parts[0].thickness:.6g} {limits(drawings.indications.row('thickness', front.number))}"
-    lines = [f"Element {parts[0].name}", f"⌀ {2 * parts[0].rim:.6g}, {sizes.rstrip()}"]
+    thick = toleranced(parts[0].thickness, drawings.indications.row("thickness", front.number))
+    lines = [f"Element {parts[0].name}", f"⌀ {sized(2 * parts[0].rim)}, thickness {thick}"]
     for head, column in zip(heads, cells, strict=True):
         lines += [head, *(f"  {cell}" for cell in column if cell)]
     return lines
@@ -395,7 +403,8 @@ def _asphere(paper: Paper, lens: Lens, face: Face, where: str, x: float, top: fl
             lines.append(f"{kind.name_of(k)}   {face.side * a:.10g}")
     if surface.sag_terms is not None:
         lines += remarks(surface)
-    table = sag(lens, face.number, step=face.clear / 10, semi_diameter=face.clear)
+    step = style.round_length(face.clear / 6)
+    table = sag(lens, face.number, step=step, semi_diameter=face.clear)
     lines += ["departure from the", f"best‐fit sphere ≤ {1e3 * float(table.largest):.4g} µm"]
     if face.curvature or surface.coefficients is not None:
         lines.append(f"(R {abs(float(table.best_fit_radius)):.6g})")
@@ -407,7 +416,7 @@ def _asphere(paper: Paper, lens: Lens, face: Face, where: str, x: float, top: fl
         (f"{r:.5g}", f"{face.side * z:.6f}".replace("-", "−"), f"{face.side * s:.5f}".replace("-", "−"))
         for r, z, s in zip(table.radii.tolist(), table.sag.tolist(), table.slope.tolist(), strict=True)
     ]
-    paper.table(x + 46, top - 7, (12, 19, 15), rows, 4.2)
+    paper.table(x + 46, top - 7, (12, 19, 15), rows, min(4.2, 54 / len(rows)))
 
 
 def _title_block(paper: Paper, drawings: Drawings, name: str, scale: float, corner: tuple[float, float]) -> None:
@@ -471,17 +480,17 @@ def _assembly(drawings: Drawings) -> Paper:
     foot = 92.0
     rows = [("Part", "Surfaces", "Material", "Thickness", "⌀", "Decentre", "Tilt")]
     for part in parts:
-        thick = f"{part.thickness:.6g} {limits(given.row('thickness', part.surfaces[0]))}".rstrip()
+        thick = toleranced(part.thickness, given.row("thickness", part.surfaces[0]))
         surfaces = "–".join(map(str, sorted({*part.surfaces})))
         mount = given.mounting(*part.surfaces)
-        rows.append((part.name, surfaces, label(part.glass) or "–", thick, f"{2 * part.rim:.6g}", *mount))
+        rows.append((part.name, surfaces, label(part.glass) or "–", thick, sized(2 * part.rim), *mount))
     by_name = {part.name: part for part in parts}
     for group in drawings.groups:
         if all(name in by_name for name in group):
             first, last = by_name[group[0]].surfaces[0], by_name[group[-1]].surfaces[1]
-            total = sum(by_name[name].thickness for name in group)
-            widest = 2 * max(by_name[name].rim for name in group)
-            cells = ("+".join(group), f"{first}–{last}", "cemented", f"{total:.6g}", f"{widest:.6g}")
+            joined = [by_name[name] for name in group]
+            widest = sized(2 * max(part.rim for part in joined))
+            cells = ("+".join(group), f"{first}–{last}", "cemented", _total(given, joined), widest)
             rows.append((*cells, *given.mounting(first, last)))
     pitch = min(5.0, (foot - MARGIN - 6) / len(rows))
     paper.table(MARGIN, foot, (14, 18, 34, 38, 20, 23, 23), rows, pitch)
@@ -510,6 +519,5 @@ def _distances(drawings: Drawings) -> list[tuple[str, str]]:
         if any(first <= a and b <= last for first, last in inside):
             continue
         length = abs(float(sum(surface.thickness for surface in lens.surfaces[a:b])))
-        tolerance = limits(given.row("thickness", a))
-        rows.append((f"surface {words[a]} to {words[b]}", f"{length:.6g} {tolerance}".rstrip()))
+        rows.append((f"surface {words[a]} to {words[b]}", toleranced(length, given.row("thickness", a))))
     return rows

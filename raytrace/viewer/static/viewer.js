@@ -10,6 +10,7 @@ const KINDS = {
   image_f_number: "F-number", entrance_pupil_diameter: "entrance pupil, mm", object_na: "object NA",
   paraxial_working_f_number: "working F-number", object_cone_angle: "object cone, °", float_by_stop: "stop radius, mm",
 };
+const SIZES = { semi_diameter: "semi-dia.", chip_zone: "chip zone", mechanical_semi_diameter: "mech. s.-d." }; // mm
 const MERITS = { "": "merit of the file", spot: "RMS spot", wavefront: "RMS wavefront", angular: "angular", mtf: "MTF, ¼ and ½ of range" };
 
 // -- small parts ------------------------------------------------------------------------------------------------------
@@ -542,7 +543,9 @@ class Viewer {
       const shown = this.moreNumbers || value || row.vary.includes(name) || row.follows.includes(name);
       if (!names.includes(name) && shown) names.push(name);
     }
-    return this.moreNumbers ? [...names, "semi_diameter"] : names;
+    const isPart = lens.rows.some((row) => row.chip_zone || row.fixed.includes("mechanical_semi_diameter"));
+    const sizes = Object.keys(SIZES).filter((name) => this.moreNumbers || (isPart && (name !== "chip_zone" || lens.rows.some((row) => row.chip_zone))));
+    return [...names, ...sizes];
   }
 
   // A text field shows its number, unless something else is typed into it at the moment.
@@ -555,7 +558,7 @@ class Viewer {
 
   buildTable(lens, columns) {
     this.controls = [];
-    const titles = { curvature: "radius, mm", thickness: "thickness, mm", glass: "glass", semi_diameter: "semi-dia., mm" };
+    const titles = { curvature: "radius, mm", thickness: "thickness, mm", glass: "glass", ...SIZES };
     const head = make("tr", {}, make("th", { scope: "col", textContent: "#" }), ...columns.map((name) => make("th", { scope: "col", textContent: titles[name] || name.replaceAll("_", " ") })));
     const body = lens.rows.map((row) => make("tr", { title: row.comment || "" },
       make("th", { scope: "row", textContent: row.stop ? `${row.surface} stop` : row.surface === 0 ? "object" : row.surface === lens.rows.length - 1 ? "image" : row.surface }),
@@ -572,10 +575,16 @@ class Viewer {
       this.controls.push((lens, refused) => this.show(input, lens.rows[surface].glass || "", refused));
       return make("td", {}, input);
     }
-    if (name === "semi_diameter") {
-      const input = make("input", { type: "text", "aria-label": `semi-diameter of surface ${surface}`, "data-cell": `semi_diameter:${surface}` });
-      input.addEventListener("change", () => this.edit(surface, "semi_diameter", input.value, input));
-      this.controls.push((lens, refused) => this.show(input, lens.rows[surface].semi_diameter === null ? "" : typed(lens.rows[surface].semi_diameter), refused));
+    if (name in SIZES) {
+      const size = name.replace("semi_", "semi-").replaceAll("_", " ");
+      const input = make("input", { type: "text", className: "size", "aria-label": `${size} of surface ${surface}, mm`, "data-cell": `${name}:${surface}` });
+      input.addEventListener("change", () => this.edit(surface, name, input.value, input));
+      this.controls.push((lens, refused) => {
+        const value = lens.rows[surface][name], follows = name !== "chip_zone" && !lens.rows[surface].fixed.includes(name);
+        input.classList.toggle("automatic", follows);
+        input.title = follows ? "mm, automatic; a number that is typed is fixed" : name === "chip_zone" ? "mm" : "mm, fixed; an empty field is automatic";
+        this.show(input, value === null || (name === "chip_zone" && value === 0) ? "" : follows ? words(value, 5) : typed(value), refused);
+      });
       return make("td", {}, input);
     }
     if (!(name in row.cells)) return make("td", {});
