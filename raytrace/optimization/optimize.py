@@ -15,7 +15,7 @@ import torch
 from raytrace.files import check_output
 from raytrace.maths.result import plain
 from raytrace.optimization.attained import Attained, NotReached, attained
-from raytrace.optimization.between import warn_of_worse, worse_between
+from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
@@ -117,7 +117,7 @@ def optimize(
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable), and for spots that are more than 1.5 times as large between the fields, wavelengths or rays
-    of the lens as beside them (WorseBetween; `Optimized.between`).
+    of the lens as beside them (WorseBetween; `Optimized.between` and the text list all ratios).
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance, BadStock,
     BadPlates.
     """
@@ -472,7 +472,7 @@ def _optimized(
         history=tensor(np.reshape(cycles, (-1, 5))),
         merit_before=merits[0],
         merit_after=merits[1],
-        between=worse_between(after),
+        between=() if after.afocal else between(after),
         **more,
     )
 
