@@ -56,7 +56,9 @@ class Incidence(OverField):
     def tables(self) -> list[Table]:
         if self.surfaces:
             return [Table(self.columns())]
-        return [Table(self.summary(), ["angles of incidence on the sensor, of the rays at both rims and the chief ray"])]
+        return [
+            Table(self.summary(), ["angles of incidence on the sensor, of the rays at both rims and the chief ray"])
+        ]
 
     def at(self, fields: Tensor) -> "Incidence":
         return _incidence(self.lens, fields)

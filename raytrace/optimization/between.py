@@ -86,7 +86,10 @@ def summary(gaps: Sequence[Between]) -> list[str]:
         if gap.ratio >= largest.get(gap.samples, gap).ratio:
             largest[gap.samples] = gap
     even = [f"{gap.ratio:.3g} {_EVEN[gap.samples]}" for gap in largest.values() if not gap.is_worse]
-    return [*lines, *([f"largest ratio of RMS spot radii to those of the merit function: {', '.join(even)}"] if even else [])]
+    return [
+        *lines,
+        *([f"largest ratio of RMS spot radii to those of the merit function: {', '.join(even)}"] if even else []),
+    ]
 
 
 def warn_of_worse(gaps: Sequence[Between]) -> None:

@@ -45,11 +45,12 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
-from raytrace.tracing.geometry import warn_of_defects
+from raytrace.tracing.geometry import warn_of_defects, with_contacts
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level, option
 
 _LOG = logging.getLogger(__name__)
+_CONTACTS = 4  # times that the spacers of a lens with temperatures have contact at the semi-diameters of its rays anew
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
@@ -269,6 +270,22 @@ def optimize(
             cycles=0 if opening.interrupted else cycles, seconds=None if seconds is None else until - time.monotonic(),
             watch=seen.after_cycle_of_paths, resume=resumed.descent,
         )  # fmt: skip
+        for _ in range(_CONTACTS):
+            design = lens_at(descent.state.x)
+            moved = with_contacts(design)
+            if moved is design or opening.interrupted or descent.stopped == "interrupted":
+                break
+            problem = Problem(
+                dataclasses.replace(problem.model, lens=moved), rows.rows, conditions, as_built=term, **of_rows
+            )
+            again = best_of_paths(
+                problem.state, descent.state.x, lower=lower, upper=upper, typical=typical, paths=1, cycles=cycles,
+                seconds=None if seconds is None else until - time.monotonic(), watch=seen.after_cycle_of_paths,
+            )  # fmt: skip
+            descent = dataclasses.replace(
+                again, history=(*descent.history, *again.history), cycles=descent.cycles + again.cycles,
+                evaluations=descent.evaluations + again.evaluations,
+            )  # fmt: skip
         merit_of_rows, count = float(np.sqrt(descent.state.cost)), len(descent.history)
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
     fitted, descended, evaluations = None, 0, 0

@@ -88,7 +88,8 @@ class Optimized(Result):
     were chosen. conditions: targets and values reached of
     conditions and boundaries. as_built: spots of the lens as built, if it is a term of the merit, which then includes
     it. loss: the way of a loss, in the place of rows. between: the largest spots between fields, wavelengths and rays
-    relative to those beside them; none of an afocal lens. fitted: the parts of stock or test plates that the lens has taken.
+    relative to those beside them; none of an afocal lens. fitted: the parts of stock or test plates that the lens has
+    taken.
     """
 
     lens: Lens

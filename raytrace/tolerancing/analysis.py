@@ -255,7 +255,7 @@ class ToleranceAnalysis(Result):
         write_lens(self.lens.with_tolerances(self.tolerances), path, catalogs=catalogs)
 
     def columns(self) -> dict[str, Tensor]:
-        """Changes by tolerances, the worst first; angles of irregularities, which change nothing alone, are left out."""
+        """Changes by tolerances, the worst first, without angles of irregularities, which change nothing alone."""
         angles = torch.tensor([row.kind == "irregularity_angle" for row in self.tolerances], dtype=torch.bool)
         order, (low, high) = self.worst, self.tolerances.ranges
         order = order[~angles[order]]

@@ -486,7 +486,7 @@ class _Writer:
             self.lines.append(f"TOL STAT {_CODES[drawn[0]]} {drawn[1]:g} 0.0 0.0 0 0 0")
 
     def _row(self, row: Tolerance) -> None:
-        kind, (k, last), second = KINDS[row.kind], (row.surfaces + row.surfaces)[:2] or (0, 0), 0
+        kind, k, second = KINDS[row.kind], (*row.surfaces, 0)[0], 0
         name, power = kind.operand, kind.length
         if row.kind == "operand":
             name, k, second = "TMCO", (row.operand or 0) + 1, row.configuration
@@ -545,7 +545,9 @@ class _Writer:
 
     def _terms(self, group: Sequence[Tolerance]) -> None:
         first, terms = group[0], sorted(row.term for row in group)
-        alike = all((row.kind, row.surfaces, row.maximum) == (first.kind, first.surfaces, first.maximum) for row in group)
+        alike = all(
+            (row.kind, row.surfaces, row.maximum) == (first.kind, first.surfaces, first.maximum) for row in group
+        )
         even = all(row.distribution == "end_points" and row.minimum == -row.maximum for row in group)
         if not (alike and even and terms == [*range(terms[0], terms[-1] + 1)]):
             message = "a .zmx file has terms in a row with equal limits ± and the distribution 'end_points'"
