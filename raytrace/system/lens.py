@@ -37,8 +37,6 @@ from raytrace.words import both_spellings, calling_level, did_you_mean, option
 
 if TYPE_CHECKING:
     from raytrace.optimization.conditions import Condition
-    from raytrace.system.tolerance_data import Compensator, Tolerance
-    from raytrace.tolerancing.table import ToleranceTable
 
 #: Units of a field point by the kind of field.
 FIELD_UNITS = dict(angle="degrees", object_height="mm", paraxial_image_height="mm", real_image_height="mm")
@@ -426,13 +424,11 @@ class Lens:
 
         return with_conditions(self, conditions, only=only)
 
-    def with_tolerances(
-        self, tolerances: "ToleranceTable | Iterable[Tolerance]", compensators: "Iterable[Compensator]" = ()
-    ) -> "Lens":
+    def with_tolerances(self, tolerances: Iterable[Any], compensators: Iterable[Any] = ()) -> "Lens":
         """The lens with these tolerances instead of its own, as lines of a .zmx file: those of `rt.tolerances`, or of
-        a study, `rt.tolerance(…).tolerances`, tightened ones too; () removes all. compensators: besides those of a
-        table. An Abbe number in % is stored as a number; radial tilts and runouts are two lines with comments that
-        link them. Raises BadTolerance for one of a surface that the lens does not have, or that OpticStudio has not."""
+        a study, `rt.tolerance(…).tolerances`, tightened ones too, or rows `Tolerance`; () removes all. compensators:
+        `Compensator`, besides those of a table. An Abbe number in % is stored as a number; radial tilts and runouts are
+        two lines with comments that link them. Raises BadTolerance for one that the lens or OpticStudio has not."""
         from raytrace.tolerancing.files import with_tolerances
 
         return with_tolerances(self, tolerances, compensators)
