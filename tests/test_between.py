@@ -39,11 +39,14 @@ def test_an_optimised_lens_says_where_its_spots_are_worse():
     with pytest.warns(WorseBetween, match="between the fields, at 10°.*add fields"):
         result = rt.optimize(lens, merit="spot", vary="curvature thickness:2,4 sensor", cycles=20)
     radii = rt.spot(result.lens, fields=[0, 10, 20]).whole.rms_radius
-    (gap,) = result.between
+    (gap,) = (gap for gap in result.between if gap.is_worse)
     assert gap.ratio == pytest.approx(float(radii[1] / radii[[0, 2]].max()), rel=1e-9)
     assert gap.ratio > 1.5
     assert str(gap) in str(result)
     assert result.document()["between"][0]["radius"] == gap.radius
+    others = [gap for gap in result.between if not gap.is_worse]
+    assert others
+    assert f"{max(gap.ratio for gap in others if gap.samples == 'rays'):.3g} over the whole pupil" in str(result)
 
 
 def test_a_lens_that_is_even_over_its_field_says_nothing():

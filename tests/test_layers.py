@@ -14,12 +14,12 @@ from layers import FLOORS, MODULES, PACKAGE, package_of, parsed, statements
 #: Commands, whose imports may wait until they run.
 COMMANDS = re.compile(r"cli(\.|$)")
 
-#: The value of a lower layer is shown by a higher one, and a lens at another temperature has edges where rays reach:
-#: the only imports against the layers, inside methods.
+#: The value of a lower layer is shown by a higher one, a lens at another temperature has edges where rays reach, and a
+#: lens stores conditions and tolerances: the only imports against the layers, inside methods.
 SHOWN_BY = {
     "system.lens": (
         *("tracing.lens_report", "tracing.geometry", "tracing.paraxial", "analysis.layout"),
-        "optimization.conditions",
+        *("optimization.conditions", "tolerancing.files"),
     ),
     "tracing.lens_report": ("optimization.attained",),
     "psf_models.result": ("psf_models.figures", "psf_models.cross_section"),

@@ -11,6 +11,7 @@ import torch
 import raytrace as rt
 from raytrace.maths.numerics import Dual
 from raytrace.optimization.variables import design_variables
+from raytrace.tracing.geometry import semi_diameters
 
 
 def air_spaced(**last):
@@ -89,10 +90,16 @@ def numbers(lens):
     return [(s.thickness.item(), 0.0 if s.curvature is None else s.curvature.item()) for s in lens.surfaces[1:]]
 
 
+def in_one_configuration(lens):
+    """Configuration 1 alone, with contact of the spacers at the semi-diameters that it stores."""
+    data = dataclasses.replace(lens.optimization_data, semi_diameters=tuple(range(1, len(lens.surfaces) - 1)))
+    return dataclasses.replace(lens.configuration(1), operands=(), optimization_data=data)
+
+
 def test_configurations_are_the_lens_at_each_temperature():
     lens = warm()
     assert [each.environment.temperature.item() for each in lens.configurations] == [20.0, -20.0, 60.0]
-    start = dataclasses.replace(lens.configuration(1), operands=())
+    start = in_one_configuration(lens)
     for number, celsius in ((2, -20), (3, 60)):
         assert numbers(lens.configuration(number)) == numbers(start.at(temperature=celsius))
     with pytest.raises(ValueError, match="the lens has 3 configurations; temperatures"):
@@ -108,7 +115,7 @@ def test_variables_of_the_lens_move_all_temperatures():
     x = model.start + np.array([1e-4 if v.quantity == "curvature" else 0.3 for v in model.variables])
     x[[v.quantity == "a4" for v in model.variables]] = 2e-7
     moved = model.lens_at(x)
-    start = dataclasses.replace(moved.configuration(1), operands=())
+    start = in_one_configuration(moved)
     for number, celsius in ((2, -20), (3, 60)):
         state, hot = model.views[number - 1].state(Dual(x, np.eye(len(x)))), moved.configuration(number)
         expected = numbers(start.at(temperature=celsius))
@@ -186,3 +193,30 @@ def test_the_semi_diameters_at_temperatures_are_those_of_the_rays_and_not_of_an_
     warm = earlier.with_temperatures([-20, 60], mount="aluminium")
     for surface, expected in zip(warm.surfaces[1:-1], lens.surfaces[1:-1], strict=True):
         assert float(surface.semi_diameter) == pytest.approx(float(expected.semi_diameter), rel=1e-9)
+
+
+def test_automatic_semi_diameters_follow_the_rays_of_an_athermal_lens(tmp_path):
+    """After an optimisation they are those of the rays, the spacers have contact there, and the merit is that of it."""
+    lens = air_spaced().with_semi_diameters(fixed=[4], margin=(0, 0.5))
+    start = lens.with_temperatures([-20, 60], mount="aluminium")
+    better = rt.optimize(start, vary="curvature sensor thickness:2", bounds="thickness:2..10", merit="spot", cycles=30)
+    after = better.lens
+    free = dataclasses.replace(after, operands=())  # without the operands that hold them still
+    sizes = semi_diameters(free)
+    assert abs(after.surfaces[2].semi_diameter / start.surfaces[2].semi_diameter - 1) > 1e-4
+    for k in (1, 2, 3):
+        assert after.surfaces[k].semi_diameter == pytest.approx(sizes[k], rel=2e-6)
+    assert after.surfaces[4].semi_diameter == lens.surfaces[4].semi_diameter  # fixed
+    for number, celsius in ((2, -20), (3, 60)):
+        there = in_one_configuration(after).at(temperature=celsius)
+        here = after.configuration(number)
+        assert numbers(here) == pytest.approx(np.array(numbers(there)), rel=1e-13)
+        for k in (1, 2, 3, 4):
+            assert here.surfaces[k].semi_diameter == pytest.approx(float(there.surfaces[k].semi_diameter), rel=1e-13)
+    assert float(rt.evaluate(after).merit) == pytest.approx(better.merit_after, rel=1e-9)
+    rt.write_lens(after, tmp_path / "athermal.zmx")
+    again = rt.read_lens(tmp_path / "athermal.zmx")
+    assert again.with_semi_diameters() is again
+    assert [s.semi_diameter for s in again.surfaces[1:5]] == [s.semi_diameter for s in after.surfaces[1:5]]
+    stale = again.replace(1, curvature=1.05 * again.surfaces[1].curvature)
+    assert stale.with_semi_diameters().surfaces[3].semi_diameter != stale.surfaces[3].semi_diameter

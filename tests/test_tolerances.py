@@ -1079,3 +1079,113 @@ def test_one_surface_may_move_in_several_ways_alone_and_in_its_element():
     single = rt.tolerancing.perturbed(rt.tolerancing.perturbed(lens, rows[4:], [0.1]), rows[:4], [0.1, 0.0, 0.05, 0.0])
     assert not torch.equal(rt.spot(moved).whole.centroid, rt.spot(lens).whole.centroid)
     assert rt.spot(single).whole.valid.all()
+
+
+# -- stored in a lens
+
+
+def plain_rows(table):
+    """The rows and compensators of a table by their numbers, in the order of their places."""
+    rows = [
+        (row.kind, row.surfaces, row.minimum, row.maximum, row.distribution, row.sigmas, row.adjust, row.pivot,
+         row.parameter, row.term, bool(row.group), row.configuration, row.operand)
+        for row in table.rows
+    ]  # fmt: skip
+    moved = [(c.variable, c.minimum, c.maximum) for c in table.compensators]
+    return [sorted(map(repr, rows)), moved, table.test_wavelength]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"grade": "precision"},
+        {"grade": "high", "distribution": "uniform", "sigmas": 2.0},
+        {"grade": "precision", "limits": "power=2 curvature:2=1e-5 element_roll=0.25 surface_decenter:3=0.125"},
+        {"limits": "surface_tilt=0.0625 conic:2=-0.25..0.5", "sigmas": 3.0},
+    ],
+)
+def test_a_lens_stores_its_tolerances(words, nominal, tmp_path):
+    table = rt.tolerances(nominal, compensators=[rt.system.Compensator(5, "thickness", -0.5, 0.25)], **words)
+    # an Abbe number in % is stored as a number
+    numbers = [row.unit == "%" and row.kind == "abbe" for row in table.rows]
+    exact = dataclasses.replace(table, rows=tuple(r for r, n in zip(table.rows, numbers, strict=True) if not n))
+    rt.write_lens(nominal.with_tolerances(exact), tmp_path / "stored.zmx")
+    again = rt.tolerancing.read_tolerances(tmp_path / "stored.zmx")
+    assert plain_rows(again) == plain_rows(exact)
+    assert {row.source for row in again} == {row.source for row in exact}
+    assert not again.unread
+
+
+def test_an_abbe_number_in_per_cent_is_stored_as_a_number(nominal):
+    lens = rt.read_lens("cooke_triplet")
+    table = rt.tolerances(lens, "abbe=0.5%")
+    stored = rt.tolerances(lens.with_tolerances(table))
+    for row, old in zip(stored, table, strict=True):
+        expected = 0.005 * float(abbe_number(lens.surfaces[old.surfaces[0]].glass))
+        assert (row.minimum, row.maximum) == pytest.approx((-expected, expected), rel=1e-12)
+    for k, error in enumerate((0.5, -0.25)):  # the same glass
+        lenses = [
+            rt.tolerancing.perturbed(lens, each, [error * each[k].maximum if n == k else 0.0 for n in range(len(each))])
+            for each in (table, stored)
+        ]
+        glasses = [each.surfaces[table[k].surfaces[0]].glass for each in lenses]
+        assert float(index(glasses[0], 0.45)) == pytest.approx(float(index(glasses[1], 0.45)), abs=1e-13)
+
+
+def test_radial_errors_are_stored_with_both_components(tmp_path):
+    lens = rt.read_lens("cooke_triplet")
+    table = rt.tolerances(lens, grade="precision", radial=True)
+    rt.write_lens(lens.with_tolerances(table), tmp_path / "stored.zmx")
+    again = rt.tolerancing.read_tolerances(tmp_path / "stored.zmx")
+    operands = [line.split()[1] for line in (tmp_path / "stored.zmx").read_text().splitlines() if "TOL T" in line]
+    assert operands.count("TEDR") == 3
+    assert operands.count("TETX") == operands.count("TIRX") == operands.count("TIRY") == 3
+
+    def magnitudes(of):
+        return {(error.name, of[first].surfaces): error.magnitude for first, error in of.radial.items()}
+
+    assert magnitudes(again).keys() == magnitudes(table).keys()
+    assert all(magnitudes(again)[key] == pytest.approx(size, rel=1e-14) for key, size in magnitudes(table).items())
+
+
+def test_stored_tolerances_are_in_the_unit_of_the_file(nominal):
+    lens = nominal.with_conditions("efl=40")
+    inches = dataclasses.replace(lens, optimization_data=dataclasses.replace(lens.optimization_data, unit=25.4))
+    table = rt.tolerances(inches, "thickness=0.0254 curvature=1e-5", compensators=[rt.system.Compensator(5)])
+    stored = inches.with_tolerances(table)
+    line = next(line for line in stored.optimization_data.tolerances if "TTHI" in line)
+    assert float(line.split()[5]) == pytest.approx(0.001, rel=1e-12)
+    again = rt.tolerances(stored)
+    assert [row.maximum for row in again] == pytest.approx([row.maximum for row in table], rel=1e-14)
+
+
+@pytest.mark.needs(DEVELOPMENT)
+@pytest.mark.parametrize("name", REAL)
+def test_tolerances_of_files_of_others_are_stored_again(name):
+    lens = rt.read_lens(DEVELOPMENT / f"{name}.zmx")
+    table = rt.tolerances(lens)
+    again = rt.tolerances(lens.with_tolerances(table))
+    assert sorted(again.minimum.tolist()) == pytest.approx(sorted(table.minimum.tolist()), rel=1e-12)
+    assert sorted(f"{row.name} {row.where} {row.distribution}" for row in again) == sorted(
+        f"{row.name} {row.where} {row.distribution}" for row in table
+    )
+    assert [c.variable for c in again.compensators] == [c.variable for c in table.compensators]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"limits": "element_decenter_z=0.1"}, "no operand"),
+        ({"limits": "element_decenter_radial=0.1", "distribution": "disc"}, "'disc'; a .zmx file has normal"),
+    ],
+)
+def test_tolerances_without_a_line_are_refused(words, message, nominal):
+    with pytest.raises(rt.BadTolerance, match=message):
+        nominal.with_tolerances(rt.tolerances(nominal, **words))
+
+
+def test_stored_tolerances_are_removed_by_none(nominal):
+    stored = nominal.with_tolerances(rt.tolerances(nominal, grade="high"))
+    assert stored.with_tolerances(()).optimization_data.tolerances == ()
+    with pytest.raises(rt.BadTolerance):
+        nominal.with_tolerances([T("radius", (17,), -0.1, 0.1)])

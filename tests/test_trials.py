@@ -433,3 +433,21 @@ def test_the_command_saves_trials(tmp_path, capsys):
     found = rt.tolerance(rt.read_lens("cemented_achromat"), grade="precision", trials=12, seed=3)
     check_rays(found.trial(found.worst_trial), rt.read_lens(tmp_path / "built" / "worst.zmx"))
     assert math.isfinite(float(found.trials[found.typical]))
+
+
+def test_the_command_stores_tightened_tolerances_in_a_lens(tmp_path, capsys):
+    file = tmp_path / "toleranced.zmx"
+    words = ["tolerance", "cemented_achromat", "--limits", "element_tilt_radial=0.2 thickness=0.1", "--trials", "0"]
+    assert main([*words, "--increment", "0.01", "--workshop", "any", "--save-lens", str(file)]) == 0
+    assert f"written: {file}" in capsys.readouterr().err
+    lens = rt.read_lens("cemented_achromat")
+    study = rt.tolerance(lens, limits=words[3], increment=0.01, workshop="any", trials=0)
+    assert study.tightened()
+    stored = rt.tolerances(rt.read_lens(file))
+    assert {row.source for row in stored if row.kind == "element_tilt_x"} == {
+        "tightened from limits element_tilt_radial=0.2"
+    }
+    assert dict(zip(stored.names, stored.ranges[1].tolist(), strict=True)) == pytest.approx(
+        dict(zip(study.tolerances.names, study.tolerances.ranges[1].tolist(), strict=True)), rel=1e-12
+    )
+    assert main([*words, "--save-lens", str(tmp_path / "table.csv")]) != 0  # tables hold no tolerances

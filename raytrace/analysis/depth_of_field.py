@@ -210,9 +210,10 @@ def depth_of_field(
     if bool(torch.isnan(near).all()) and bool(torch.isnan(hyperfocal)):
         quantity = measured.quantity(float(1 / lens.surfaces[0].thickness.detach()))
         least = float(quantity.max() if criterion == "modulation" else quantity.min())
+        unit = {"blur": " mm", "modulation": "", "wavefront": " waves RMS"}[criterion]
         raise NothingToShow(
             f"nothing to show: no field is sharp at any distance; the {criterion} at the object distance of the lens "
-            f"is {least:.4g} at best, the limit {limit:.4g}; focus the lens, or give another limit"
+            f"is {least:.4g}{unit} at best, the limit {limit:.4g}{unit}; focus the lens, or give another limit"
         )
     return DepthOfField(
         lens=lens,

@@ -296,7 +296,9 @@ def focus(
         message = (
             f"the image is virtual, at {float(best):g} mm, on the side of the last surface that the light comes from"
         )
-        warnings.warn(f"{message}: move the object further away", VirtualImage, stacklevel=calling_level())
+        if bool(torch.isfinite(lens.surfaces[0].thickness)):
+            message += ": move the object further away"
+        warnings.warn(message, VirtualImage, stacklevel=calling_level())
     return result
 
 

@@ -54,7 +54,11 @@ class Incidence(OverField):
         return {**self.heads(wavelength=self.wavelengths), "height": height, **dict(zip(_RAYS, angles, strict=True))}
 
     def tables(self) -> list[Table]:
-        return [Table(self.columns() if self.surfaces else self.summary())]
+        if self.surfaces:
+            return [Table(self.columns())]
+        return [
+            Table(self.summary(), ["angles of incidence on the sensor, of the rays at both rims and the chief ray"])
+        ]
 
     def at(self, fields: Tensor) -> "Incidence":
         return _incidence(self.lens, fields)

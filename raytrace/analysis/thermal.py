@@ -12,11 +12,11 @@ from raytrace.analysis.panels import ruled
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import NothingToShow, Numbers, Points, like, setting, wavelength_shares
 from raytrace.materials.environment import NoThermalCoefficients
-from raytrace.materials.mounts import expansion_of
+from raytrace.materials.mounts import expansion_of, mount_words
 from raytrace.maths.numerics import value
-from raytrace.maths.result import Column
+from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import SAMPLINGS, gauss_rings
-from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, fill, new_figure, number_text, styled
+from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, fill, new_figure, styled
 from raytrace.system.lens import Lens, aligned, temperature_of, with_sensor_distance
 from raytrace.tracing.focus import focus_of_rms, mean_rms_radius
 from raytrace.tracing.paraxial import first_order
@@ -84,6 +84,12 @@ class Thermal(Analysis):
             "depth_of_focus_um": 1e3 * float(self.depth_of_focus),
         }
 
+    def tables(self) -> list[Table]:
+        words = [f"mount: {mount_words(float(self.expansion))}, of spaces that state no expansion"]
+        words += [] if self.frequency is None else [f"MTF at {self.frequency:.4g} cycles/mm"]
+        words.append(f"a focus shift of ±{1e3 * float(self.depth_of_focus):.3g} µm is λ/4 of wavefront")
+        return [Table(self.columns(), ["; ".join(words)])]
+
     @styled
     def draw(self) -> Figure:
         """Focus shift between the limits of a quarter wave, RMS spot radius and modulation over temperature."""
@@ -91,8 +97,7 @@ class Thermal(Analysis):
         if self.rms is not None:
             curves.append((1e3 * self.rms, "RMS spot radius (µm)", None))
         if self.modulation is not None and self.frequency is not None:
-            cycles = number_text(float(self.frequency), 4)
-            curves.append((self.modulation, f"lowest modulation at {cycles} cycles/mm", 1.0))
+            curves.append((self.modulation, f"lowest modulation at {self.frequency:.4g} cycles/mm", 1.0))
         count, celsius = 1 + len(curves), array(self.temperatures)
         figure = new_figure({1: 5.2, 2: 7.4, 3: 10.5}[count], 3.6)
         shift, *others = (ruled(panel) for panel in figure.subplots(1, count, squeeze=False)[0])
@@ -116,7 +121,7 @@ class Thermal(Analysis):
             panel.set_ylabel(name)
             panel.axvline(float(temperature_of(self.lens)), color=GREY, linewidth=0.8)
             panel.legend(fontsize=7.5)
-        title = f"{self.lens.name or 'Lens'}\nover temperature, mount of {float(self.expansion):g}e-6/K"
+        title = f"{self.lens.name or 'Lens'}\nover temperature, mount: {mount_words(float(self.expansion))}"
         figure.suptitle(fill(title, figure.get_figwidth(), 10, bold=True), fontweight="bold", fontsize=10)
         return figure
 

@@ -1164,11 +1164,14 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         cooke_triplet --grade precision --plot as_built.png
         lens.zmx --trials 10000 --checkpoint trials.jsonl -o sensitivities.csv
         double_gauss --grade commercial --save-trials built
+        cooke_triplet --grade precision --radial --goal 23.5 --yield 0.9 --save-lens toleranced.zmx
         tessar --limits "radius=0.1% thickness=0.02 element_tilt=0.05" --criterion wavefront --trials 0
         cooke_triplet --grade high --criterion mtf@10 --trials 200""",
         *LENS, CONDITIONS, plot("histogram, yield and the tolerances that count most"), TABLE,
         Option("save_trials", folder_name, "FOLDER", "write the lenses of the typical, the worst and the best trial "
             "there, as .zmx files"),
+        Option("save_lens", file_of(".zmx"), "FILE", "lens file (.zmx) to write with these tolerances, tightened ones "
+            "as they are proposed, and with the compensators: of draw, report and further studies"),
         row("grade", "tolerances of a published grade instead of the file's"),
         row("limits", "words and kinds with their limits ±, radius=0.1% thickness=0.02 element_tilt=0.05; they replace "
             "those of the file or the grade, and index=0 leaves one out; element_decenter_radial=0.02 is the magnitude "

@@ -34,7 +34,7 @@ CONDITIONS = (
 #: Options of the runner: lens, conditions and destination of the result. A function with such a parameter gets it too.
 RUNNER_OPTIONS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "flags"),
-    "save_trials",
+    *("save_trials", "save_lens"),
     *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
 #: Options that are fields of the parameter `execution`.
@@ -85,7 +85,7 @@ def _run_each(run: Run, arguments: argparse.Namespace, distances: list[float]) -
         text = f"{repr(distance).removesuffix('.0')} mm" if math.isfinite(distance) else "infinity"
         suffix = "_" + text.replace(" ", "") if several else ""
         values = {**vars(arguments), "object_distances": distance, "suffix": suffix}
-        for name in ("plot", "output"):
+        for name in ("plot", "output", "save_lens"):
             if suffix and values.get(name):
                 path = Path(values[name])
                 values[name] = str(path.with_name(path.stem + suffix + path.suffix))

@@ -159,8 +159,8 @@ def psf(arguments: argparse.Namespace) -> Result:
 
 
 def tolerance(arguments: argparse.Namespace) -> Result:
-    """The study; --save-trials writes lenses of its trials."""
-    folder = arguments.save_trials
+    """The study; --save-trials writes lenses of its trials, --save-lens the lens with its tolerances."""
+    folder, file = arguments.save_trials, arguments.save_lens
     if folder and arguments.trials == 0:
         raise CommandError(f"--save-trials {folder}: there are no trials; leave --trials 0 out")
     result = result_of_lens(arguments, raytrace.tolerance)
@@ -169,6 +169,10 @@ def tolerance(arguments: argparse.Namespace) -> Result:
         with printed_on_failure(result, arguments):
             result.save_trials(folder, catalogs=catalogs(arguments))
         say(f"written: typical.zmx, worst.zmx and best.zmx in {folder}")
+    if file and not share().rank:
+        with printed_on_failure(result, arguments):
+            result.save_lens(file, catalogs=catalogs(arguments))
+        say(f"written: {file}")
     return result
 
 

@@ -60,5 +60,11 @@ def expansion_of(material: str | float) -> float:
         ) from None
 
 
+def mount_words(expansion: float) -> str:
+    """An expansion in 1e-6/K in words, with the materials of MOUNTS that have it: "aluminium, 23.6e-6/K"."""
+    names = [name for name, mount in MOUNTS.items() if mount.expansion == expansion]
+    return ", ".join([*names, f"{expansion:g}e-6/K"])
+
+
 def _squeezed(name: str) -> str:
     return re.sub(r"[\s_-]", "", name.lower()).replace("aluminum", "aluminium")

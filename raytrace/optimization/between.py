@@ -50,6 +50,7 @@ class Between:
         )
 
 
+_EVEN = {"fields": "between fields", "wavelengths": "between wavelengths", "rays": "over the whole pupil"}
 _ADVICE = {
     "fields": "add fields",
     "wavelengths": "add wavelengths",
@@ -77,9 +78,23 @@ def worse_between(lens: Lens) -> tuple[Between, ...]:
     return tuple(worst for worst in between(lens) if worst.is_worse)
 
 
-def warn_of_worse(gaps: Sequence[Between]) -> None:
-    """Warn WorseBetween of each."""
+def summary(gaps: Sequence[Between]) -> list[str]:
+    """Lines of the gaps that are worse, and one of the largest ratios of all others."""
+    lines = [str(gap) for gap in gaps if gap.is_worse]
+    largest: dict[str, Between] = {}
     for gap in gaps:
+        if gap.ratio >= largest.get(gap.samples, gap).ratio:
+            largest[gap.samples] = gap
+    even = [f"{gap.ratio:.3g} {_EVEN[gap.samples]}" for gap in largest.values() if not gap.is_worse]
+    return [
+        *lines,
+        *([f"largest ratio of RMS spot radii to those of the merit function: {', '.join(even)}"] if even else []),
+    ]
+
+
+def warn_of_worse(gaps: Sequence[Between]) -> None:
+    """Warn WorseBetween of those that are worse."""
+    for gap in (gap for gap in gaps if gap.is_worse):
         warnings.warn(str(gap), WorseBetween, stacklevel=calling_level())
 
 

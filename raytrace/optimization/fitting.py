@@ -89,7 +89,8 @@ class FitStep:
     """One step of a fit.
 
     kind: "design", the lens before it, "fitted" or "exchanged"; surfaces, name: of the item and its candidate;
-    predicted, reached: merits.
+    predicted, reached: merits; missed: the largest violation of a condition, 0 where they are met; exceeded: how many
+    parts are smaller than the light. A design with fewer of both takes the place of one with a lower merit.
     """
 
     kind: str
@@ -98,6 +99,15 @@ class FitStep:
     surfaces: str = ""
     name: str = ""
     predicted: float = float("nan")
+    missed: float = 0.0
+    exceeded: int = 0
+
+    @property
+    def note(self) -> str:
+        """Why a later step may have a higher merit."""
+        missed = [f"a condition missed by {self.missed:.2g}"] if self.missed else []
+        smaller = [f"{self.exceeded} smaller than the light"] if self.exceeded else []
+        return ", ".join(missed + smaller)
 
 
 @value
@@ -134,6 +144,8 @@ class Fitted:
             Column("cost", form=".3g"): ["", *cost],
             Column("seconds", form=".1f", heading="s"): [step.seconds for step in self.steps],
         }
+        if any(step.note for step in self.steps):
+            columns[Column("note", form="<")] = [step.note for step in self.steps]
         notes = [f"surfaces {surfaces}: {text}" for surfaces, text in self.notes]
         is_fitted = len(self.steps) > 1
         entries = [Table(self.entries if is_fitted else {}, [""], ["", *notes] if notes and is_fitted else notes)]
@@ -237,7 +249,8 @@ class Fit(ABC):
             self.missing += [
                 (item.words, "interrupted before it was fitted") for item in items if item not in best.chosen
             ]
-        self.steps = [*self.steps[:-1], dataclasses.replace(self.steps[-1], reached=best.merit)]
+        last = self.steps[-1]
+        self.steps = [*self.steps[:-1], dataclasses.replace(self.ended(last, best), seconds=last.seconds)]
         return best
 
     def report(self, design: Design) -> Fitted:
@@ -279,10 +292,7 @@ class Fit(ABC):
                 ends.append((end, [*beam[k][1], step]))
             ends.sort(key=lambda pair: pair[0].score())
             beam = [(self.descend(end, self.cycles), steps) for end, steps in ends[:BEAM]]
-            beam = [
-                (end, [*steps[:-1], dataclasses.replace(steps[-1], reached=end.merit, seconds=self.seconds)])
-                for end, steps in beam
-            ]
+            beam = [(end, [*steps[:-1], self.ended(steps[-1], end)]) for end, steps in beam]
             beam.sort(key=lambda pair: self.rank(pair[0]))
             self.so_far = beam[0]
         return beam[0]
@@ -307,13 +317,19 @@ class Fit(ABC):
             if self.rank(end) < (*first, merit * (1 - _GAIN)):
                 design, left = end, [other for other in design.chosen if other != item]
                 words = item.words, self.name(item, candidate)
-                self.steps.append(FitStep("exchanged", end.merit, self.seconds, *words, predicted))
+                step = FitStep("exchanged", end.merit, self.seconds, *words, predicted)
+                self.steps.append(self.ended(step, end))
         return design
 
     def rank(self, design: Design) -> tuple[float, int, float, float]:
         """Fewer failed rays, then fewer parts that are smaller than the light, conditions met, and a lower merit."""
         missed = design.missed if design.missed > _MET else 0.0
         return design.state.lost, len(self.exceeded(design)), missed, design.merit
+
+    def ended(self, step: FitStep, design: Design) -> FitStep:
+        """A step with the design at its end."""
+        _, exceeded, missed, merit = self.rank(design)
+        return dataclasses.replace(step, reached=merit, seconds=self.seconds, missed=missed, exceeded=exceeded)
 
     def trial(self, design: Design, item: Item, candidate: Any) -> Design:
         """The design with a candidate, optimised over some cycles."""

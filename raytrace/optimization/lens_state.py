@@ -28,8 +28,8 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Dual, Number, Vector, dot, is_any, slope_of, value_of
 from raytrace.maths.tangents import tangents_of, with_tangents
-from raytrace.system.configurations import Operand, ScaledPath, taken, with_entry, with_operands
-from raytrace.system.expansion import expanded, growth, in_contact, is_solid
+from raytrace.system.configurations import Operand, ScaledPath, with_entry, with_operands
+from raytrace.system.expansion import growth, in_contact, is_solid
 from raytrace.system.lens import Lens, index_behind, is_round_about_axis, media, per_lens, temperature_of
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import (
@@ -53,7 +53,7 @@ from raytrace.system.rays import Rays
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, is_flat, medium_surfaces, power, sag_at, signed, vertex_curvature
 from raytrace.tracing.compiled import Task, is_expressible, rows_of, structure_of
-from raytrace.tracing.geometry import contact_heights, edge_thickness, semi_diameter
+from raytrace.tracing.geometry import contact_heights, edge_thickness, semi_diameter, with_thermal_numbers
 from raytrace.tracing.launch import path_from_point, path_towards_lens, rays_of_field, vignette
 from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, gaussian
 from raytrace.tracing.trace import (
@@ -165,22 +165,6 @@ class DesignVariables:
             return False
         surfaces = self.lens.surfaces
         return not is_solid(surfaces[medium_surfaces(surfaces)[rule.surface]].glass)
-
-
-def with_thermal_numbers(lens: Lens, solves: Sequence[Solve]) -> Lens:
-    """The lens whose numbers with thermal pickups are those of their source, expanded."""
-    rules = [rule for rule in solves if rule.kind == "thermal"]
-    operands = list(lens.operands)
-    for source, configuration in dict.fromkeys((rule.source, rule.configuration) for rule in rules):
-        start, here = (with_operands(lens, number) for number in (source, configuration))
-        warmer = temperature_of(here) - temperature_of(start)
-        heights = contact_heights(start, in_contact(start.surfaces))
-        warm = dataclasses.replace(start, surfaces=expanded(start.surfaces, warmer, heights))
-        for rule in rules:
-            if (rule.source, rule.configuration) == (source, configuration) and rule.operand is not None:
-                operands[rule.operand] = taken(operands[rule.operand], warm, configuration - 1)
-    lens = dataclasses.replace(lens, operands=tuple(operands))
-    return with_operands(lens, lens.current_configuration) if rules else lens
 
 
 def _numbers_of(operand: Operand) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from raytrace.files import check_output
 from raytrace.maths.result import plain
 from raytrace.optimization.attained import Attained, NotReached, attained
-from raytrace.optimization.between import warn_of_worse, worse_between
+from raytrace.optimization.between import between, warn_of_worse
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Log, Stored, read_checkpoint
 from raytrace.optimization.conditions import Condition, conditions_in_unit, specified
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
@@ -45,11 +45,12 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
-from raytrace.tracing.geometry import warn_of_defects
+from raytrace.tracing.geometry import warn_of_defects, with_contacts
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level, option
 
 _LOG = logging.getLogger(__name__)
+_CONTACTS = 4  # times that the spacers of a lens with temperatures have contact at the semi-diameters of its rays anew
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
@@ -117,7 +118,7 @@ def optimize(
     Conditions that certainly exclude one another are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason, with a warning (NotReached), as for surfaces and gaps that cannot
     be made (Unbuildable), and for spots that are more than 1.5 times as large between the fields, wavelengths or rays
-    of the lens as beside them (WorseBetween; `Optimized.between`).
+    of the lens as beside them (WorseBetween; `Optimized.between` and the text list all ratios).
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint, BadTolerance, BadStock,
     BadPlates.
     """
@@ -269,6 +270,22 @@ def optimize(
             cycles=0 if opening.interrupted else cycles, seconds=None if seconds is None else until - time.monotonic(),
             watch=seen.after_cycle_of_paths, resume=resumed.descent,
         )  # fmt: skip
+        for _ in range(_CONTACTS):
+            design = lens_at(descent.state.x)
+            moved = with_contacts(design)
+            if moved is design or opening.interrupted or descent.stopped == "interrupted":
+                break
+            problem = Problem(
+                dataclasses.replace(problem.model, lens=moved), rows.rows, conditions, as_built=term, **of_rows
+            )
+            again = best_of_paths(
+                problem.state, descent.state.x, lower=lower, upper=upper, typical=typical, paths=1, cycles=cycles,
+                seconds=None if seconds is None else until - time.monotonic(), watch=seen.after_cycle_of_paths,
+            )  # fmt: skip
+            descent = dataclasses.replace(
+                again, history=(*descent.history, *again.history), cycles=descent.cycles + again.cycles,
+                evaluations=descent.evaluations + again.evaluations,
+            )  # fmt: skip
         merit_of_rows, count = float(np.sqrt(descent.state.cost)), len(descent.history)
         seen.write(descent.state.x, merit_of_rows, count, descent=seen.descent, now=True)
     fitted, descended, evaluations = None, 0, 0
@@ -472,7 +489,7 @@ def _optimized(
         history=tensor(np.reshape(cycles, (-1, 5))),
         merit_before=merits[0],
         merit_after=merits[1],
-        between=worse_between(after),
+        between=() if after.afocal else between(after),
         **more,
     )
 

@@ -14,7 +14,7 @@ from raytrace.materials.selection import GlassList, columns_of
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Columns, Result, Table, number, plain
 from raytrace.optimization.attained import Attained, table_of
-from raytrace.optimization.between import Between
+from raytrace.optimization.between import Between, summary
 from raytrace.optimization.checkpoint import STOPPED
 from raytrace.optimization.fitting import Fitted
 from raytrace.optimization.glass_choice import GlassStep
@@ -87,8 +87,9 @@ class Optimized(Result):
     glasses were chosen; chosen_from: the glasses that could be chosen; spacers: the steps in which materials of spacers
     were chosen. conditions: targets and values reached of
     conditions and boundaries. as_built: spots of the lens as built, if it is a term of the merit, which then includes
-    it. loss: the way of a loss, in the place of rows. between: spots between fields, wavelengths or rays that are more
-    than 1.5 times those beside them. fitted: the parts of stock or test plates that the lens has taken.
+    it. loss: the way of a loss, in the place of rows. between: the largest spots between fields, wavelengths and rays
+    relative to those beside them; none of an afocal lens. fitted: the parts of stock or test plates that the lens has
+    taken.
     """
 
     lens: Lens
@@ -210,7 +211,7 @@ class Optimized(Result):
             *([f"  {line}" for line in self.loss.lines()] if self.loss else []),
             *(f"  {step.words}; merit {step.reached:.6g}, predicted {step.predicted:.6g}" for step in self.spacers),
             *self._unsharp_start(),
-            *(f"  {spot}" for spot in self.between),
+            *(f"  {line}" for line in summary(self.between)),
             "",
         ]
         variables: Columns = {

@@ -12,6 +12,7 @@ from raytrace.analysis.spot_diagram import airy_radius, draw_spot_to_scale, fiel
 from raytrace.maths.numerics import detached
 from raytrace.optimization.attained import shown, table_of
 from raytrace.optimization.checkpoint import STOPPED
+from raytrace.optimization.fitting import Fitted
 from raytrace.optimization.loss import LossReport
 from raytrace.optimization.optimized import Optimized
 from raytrace.plotting import style
@@ -128,19 +129,37 @@ def _draw_spots(page: Any, drawn: list[tuple[str, Lens, Lens]]) -> None:
 
 
 def _draw_history(axes: "Axes", result: Optimized) -> None:
+    if result.fitted is not None:
+        return _draw_fit(axes, result, result.fitted)
     of_glasses = [step.reached for step in result.glasses]
     merit = np.concatenate([[result.merit_before], of_glasses, style.array(result.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
     _scale_merit(axes, merit)
     axes.locator_params(axis="x", integer=True)
     axis = "step of the choice of glasses, then cycle" if of_glasses else "cycle"
-    axes.set_xlabel(f"{axis} ({result.evaluations} evaluations, {result.seconds:.2g} s)")
+    axes.set_xlabel(f"{axis} ({result.evaluations} evaluations, {_time(result)})")
     axes.set_ylabel(result.measure)
     axes.set_title("Merit function" if result.loss is None else "Loss", fontweight="bold")
     axes.annotate(
         STOPPED[result.stopped], (0.98, 0.94), xycoords="axes fraction", ha="right", fontsize=7.5, color=style.GREY
     )
     axes.grid(alpha=0.25)
+
+
+def _draw_fit(axes: "Axes", result: Optimized, fitted: Fitted) -> None:
+    """The merit after each step of a fit of parts or test plates."""
+    merit = np.array([step.reached for step in fitted.steps])
+    names = [f"{step.surfaces} {step.name}".strip() or "design" for step in fitted.steps]
+    axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker=".", markersize=4)
+    _scale_merit(axes, merit)
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=6.5)
+    axes.set_ylabel(result.measure)
+    axes.set_title(f"Merit after each step ({_time(result)})", fontweight="bold")
+    axes.grid(alpha=0.25)
+
+
+def _time(result: Optimized) -> str:
+    return f"{result.seconds:.2g} s" if result.seconds < 99.5 else f"{result.seconds:.0f} s"
 
 
 def _scale_merit(axes: "Axes", merit: np.ndarray) -> None:
@@ -193,7 +212,9 @@ def _groups(result: Optimized) -> list[tuple[int, str]]:
     operand, the first of these with few names."""
     counts = [i for i in result.rows if result.merit[i - 1].weight != 0]
     rows = {i: result.merit[i - 1] for i in counts}
-    field = {i: "".join(f" {h:.3g}" for h in row.numbers[:2]) if any(row.numbers) else "" for i, row in rows.items()}
+    field = {
+        i: f" field {row.numbers[0]:.3g}, {row.numbers[1]:.3g}" if any(row.numbers) else "" for i, row in rows.items()
+    }
     names = (
         {i: f"{row.name} {i}" for i, row in rows.items()},
         {i: row.name + field[i] for i, row in rows.items()},

@@ -239,7 +239,7 @@ def searched(
         tables.append({f"{v.quantity}_{v.surface}": number for v, number in variables})
     names = tuple(dict.fromkeys(name for table in tables for name in table))
     gaps = [between(of_minimum) for of_minimum in lenses]
-    warn_of_worse([gap for gap in gaps[0] if gap.is_worse])
+    warn_of_worse(gaps[0])
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
     return Searched(
         before=lens,

@@ -193,17 +193,17 @@ def at_temperatures(lens: Whole, warm: Sequence[Whole]) -> Whole:
             Solve(k, quantity, "thermal", (float(index),), 1, configuration=c, operand=index)
             for c in range(2, len(states) + 1)
         ]
-    fixed = [k for k, surface in enumerate(lens.surfaces[:-1]) if surface.semi_diameter]
-    for k in fixed:
+    sized = [k for k, surface in enumerate(lens.surfaces[:-1]) if surface.semi_diameter]
+    for k in sized:
         words = tuple((state.surfaces[k].semi_diameter,) for state in states)
         operands.append(Operand("SDIA", k, paths=(ScaledPath(("surfaces", k, "semi_diameter")),), words=words))
     variables = tuple(
         dataclasses.replace(vary, configuration=1, operand=moved[vary.address]) if vary.address in moved else vary
         for vary in data.variables
     )
-    data = dataclasses.replace(
-        data, variables=variables, solves=(*data.solves, *rules), semi_diameters=tuple({*data.semi_diameters, *fixed})
-    )
+    stated = {*data.semi_diameters, *(rule.surface for rule in data.kept if rule.quantity == "semi_diameter")}
+    automatic = [Solve(k, "semi_diameter", "maximum") for k in sized if k not in stated]
+    data = dataclasses.replace(data, variables=variables, solves=(*data.solves, *rules), kept=(*data.kept, *automatic))
     return with_operands(dataclasses.replace(lens, operands=tuple(operands), optimization_data=data), 1)
 
 

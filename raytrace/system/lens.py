@@ -427,6 +427,15 @@ class Lens:
 
         return with_conditions(self, conditions, only=only)
 
+    def with_tolerances(self, tolerances: Iterable[Any], compensators: Iterable[Any] = ()) -> "Lens":
+        """The lens with these tolerances instead of its own, as lines of a .zmx file: those of `rt.tolerances`, or of
+        a study, `rt.tolerance(…).tolerances`, tightened ones too, or rows `Tolerance`; () removes all. compensators:
+        `Compensator`, besides those of a table. An Abbe number in % is stored as a number; radial tilts and runouts are
+        two lines with comments that link them. Raises BadTolerance for one that the lens or OpticStudio has not."""
+        from raytrace.tolerancing.files import with_tolerances
+
+        return with_tolerances(self, tolerances, compensators)
+
     def __getattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"'Lens' object has no attribute {name!r}{_ELSEWHERE.get(name, '')}", name=name, obj=self)
 
@@ -542,24 +551,24 @@ class Lens:
 
         Operands TEMP, CRVT, THIC, PRAM and SDIA hold its numbers, as OpticStudio's thermal pickups: in an optimisation
         those of the first configuration vary, and the others follow by expansion. Solved numbers stay solved in every
-        configuration. Semi-diameters become fixed: there the spacers have contact. mount: as of `at`. Raises ValueError
-        for a lens with configurations, surfaces other than conics and even aspheres, and no other temperature.
+        configuration. Semi-diameters hold still, as the spacers have contact there; automatic ones follow the rays in
+        `with_semi_diameters` and after an optimisation. mount: as of `at`. Raises ValueError for a lens with
+        configurations, surfaces other than conics and even aspheres, and no other temperature.
         """
-        from raytrace.tracing.geometry import contact_heights
+        from raytrace.tracing.geometry import fixed_semi_diameters
 
         lens = with_environment(self if mount is None else with_mount(self, mount), None, None)
         others = [celsius for celsius in temperatures if not _is_at(lens, celsius)]
         if not others:
             reference = f"{temperature_of(lens):g} °C, that of the lens"
             raise ValueError(f"{option('temperatures')} {[*temperatures]}: expected one other than {reference}")
-        heights = contact_heights(lens, in_contact(lens.surfaces))
-        sizes = {k: float(height.detach()) or None for k, height in heights.items()}
-        surfaces = tuple(
-            dataclasses.replace(s, semi_diameter=sizes.get(k, s.semi_diameter)) for k, s in enumerate(lens.surfaces)
-        )
-        lens = dataclasses.replace(lens, surfaces=surfaces)
-        lens = lens.with_semi_diameters()  # stored automatic ones may be those of another design
-        return multiple.at_temperatures(lens, [lens.at(temperature=celsius) for celsius in others])
+        # stored automatic ones may be those of another design
+        lens = lens.with_semi_diameters(fixed=[k for k in fixed_semi_diameters(lens) if k])
+        data = lens.optimization_data
+        assert data is not None
+        sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
+        held = dataclasses.replace(lens, optimization_data=dataclasses.replace(data, semi_diameters=sized))
+        return multiple.at_temperatures(lens, [held.at(temperature=celsius) for celsius in others])
 
     def with_semi_diameters(
         self, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None

@@ -13,7 +13,7 @@ from raytrace.materials.catalogs import ENVIRONMENT, SHIPPED, medium, missing_ca
 from raytrace.materials.glass import AIR, check_unit
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
-from raytrace.words import RaytraceError, named_value
+from raytrace.words import RaytraceError, did_you_mean, named_value
 
 
 class BadPrescription(RaytraceError, ValueError):
@@ -48,7 +48,8 @@ def lens(
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
     FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: its number, from 1, the first by default.
     object_distance: mm from surface 1. catalogs: names of glass catalogs, sought first; one that is not
-    shipped is found by the environment variable RAYTRACE_CATALOGS. Raises BadPrescription, UnknownGlass.
+    shipped is found by the environment variable RAYTRACE_CATALOGS. name: the title; ray_aiming: a key of RAY_AIMING.
+    Raises BadPrescription, UnknownGlass.
     """
     rows = rows.to_dict("records") if hasattr(rows, "to_dict") else list(rows)
     if not rows:
@@ -105,8 +106,20 @@ def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surf
         raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
 
 
+#: Arguments of `lens` besides its aperture, and other words for them.
+_ARGUMENTS = (
+    *("rows", "stop", "fields", "field_kind", "wavelengths", "wavelength_weights", "primary_wavelength"),
+    *("object_distance", "name", "catalogs", "ray_aiming"),
+)
+_SYNONYMS = {"title": "name", "epd": "entrance_pupil_diameter", "primary": "primary_wavelength"}
+
+
 def _aperture(apertures: Mapping[str, float]) -> SystemAperture:
     names = {"f_number": "image_f_number"} | {kind: kind for kind in APERTURE_KINDS}
+    for other in apertures:
+        if other not in names:
+            meant = did_you_mean(_SYNONYMS.get(other, other), [*_ARGUMENTS, *names])
+            raise BadPrescription(f"{other!r} is no argument{meant}; expected {', '.join(_ARGUMENTS)} and an aperture")
     if len(apertures) != 1 or next(iter(apertures)) not in names:
         listed = ", ".join(apertures) or "none"
         raise BadPrescription(f"aperture: {listed} given; expected one of {', '.join(names)}, as f_number=3.5")

@@ -247,8 +247,18 @@ class ToleranceAnalysis(Result):
         for name, lens in zip(("typical", "worst", "best"), lenses, strict=True):
             write_lens(lens, folder / f"{name}.zmx", catalogs=catalogs)
 
+    def save_lens(self, path: str | PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
+        """Write the nominal lens with these tolerances and compensators as a .zmx file (`Lens.with_tolerances`).
+
+        catalogs: as of `save_trials`. Raises BadTolerance, LensFileError.
+        """
+        write_lens(self.lens.with_tolerances(self.tolerances), path, catalogs=catalogs)
+
     def columns(self) -> dict[str, Tensor]:
+        """Changes by tolerances, the worst first, without angles of irregularities, which change nothing alone."""
+        angles = torch.tensor([row.kind == "irregularity_angle" for row in self.tolerances], dtype=torch.bool)
         order, (low, high) = self.worst, self.tolerances.ranges
+        order = order[~angles[order]]
         lost = 100 * torch.maximum(self.lost_minimum, self.lost_maximum)
         columns = {
             "tolerance": order,
@@ -396,7 +406,9 @@ class ToleranceAnalysis(Result):
         curve = left.twinx()
         ordered = torch.sort(shown).values
         curve.plot(ordered.numpy(), np.linspace(0, 100, len(ordered))[:: self.sign], color="#2ca02c", linewidth=1.2)
-        curve.set(ylabel="yield, %", ylim=(0, 100))
+        curve.set(ylim=(0, 100))
+        curve.set_ylabel("yield, %", color="#2ca02c")
+        curve.tick_params(axis="y", colors="#2ca02c")
         side = "right" if self.sign > 0 else "left"
         left.legend(fontsize=8, loc=f"center {side}")
         order = self.worst[:12].flip(0)

@@ -43,14 +43,23 @@ _TRACED = 512  # lenses that correct the share of the model
 _SHIFTS, _CLOSE = 4, 0.003  # times that the share of the model is shifted, and the accepted error of the share
 _SOFT = 0.05  # width of the logistic curve, in standard deviations of q
 _LEAST = 1e-3  # scale of a limit
+_TIGHTENED = "tightened from "  # before the source of a row
 _TURNS, _EXACT = 4, 1e-7  # times that worst directions are searched anew, and the accepted excess of an increment
 
 
 def scaled(tolerances: ToleranceTable, low: Tensor, high: Tensor) -> ToleranceTable:
-    """The tolerances with limits multiplied by factors (N,)."""
+    """The tolerances with limits multiplied by factors (N,), which the sources of the tightened ones state."""
     pairs = zip(tolerances.rows, low.tolist(), high.tolist(), strict=True)
-    rows = [dataclasses.replace(row, minimum=a * row.minimum, maximum=b * row.maximum) for row, a, b in pairs]
+    rows = [
+        dataclasses.replace(row, minimum=a * row.minimum, maximum=b * row.maximum, source=_source(row.source, a, b))
+        for row, a, b in pairs
+    ]
     return dataclasses.replace(tolerances, rows=tuple(rows))
+
+
+def _source(source: str, low: float, high: float) -> str:
+    start = "" if source.startswith(_TIGHTENED) or (low, high) == (1.0, 1.0) else _TIGHTENED
+    return f"{start}{source}" if source else source
 
 
 class Proposal(NamedTuple):

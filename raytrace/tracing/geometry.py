@@ -24,7 +24,9 @@ from torch import Tensor
 
 from raytrace.maths.numerics import Number, detached, dot_2, safe_sqrt, value
 from raytrace.system import elements
-from raytrace.system.lens import Lens, media, per_lens
+from raytrace.system.configurations import taken, with_operands
+from raytrace.system.expansion import expanded, in_contact
+from raytrace.system.lens import Lens, media, per_lens, temperature_of
 from raytrace.system.optimization_data import OptimizationData, Solve
 from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
@@ -97,8 +99,61 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
 def fixed_semi_diameters(lens: Lens) -> dict[int, float]:
     """mm, by surface, of the semi-diameters that are given; the others follow the rays."""
     data = lens.optimization_data
-    given = range(len(lens.surfaces)) if data is None else data.semi_diameters
+    given = range(len(lens.surfaces)) if data is None else (*data.semi_diameters, *_contacts(lens))
     return {k: float(size) for k in given if (size := lens.surfaces[k].semi_diameter)}
+
+
+def _contacts(lens: Lens) -> list[int]:
+    """Surfaces whose automatic semi-diameters operands of configurations hold still: those of `with_temperatures`."""
+    data = lens.optimization_data
+    if data is None or not lens.operands:
+        return []
+    held = {path.path[1] for operand in lens.operands for path in operand.paths if path.path[-1] == _SIZE}
+    automatic = {rule.surface for rule in data.kept if rule.is_largest_size}
+    return sorted((held & automatic).difference(data.semi_diameters))
+
+
+def with_contacts(lens: Lens) -> Lens:
+    """The lens with temperatures as configurations whose spacers have contact at the automatic semi-diameters of its
+    rays in configuration 1; the others follow by expansion. Others keep theirs. See `Lens.with_temperatures`."""
+    numbers = _contacts(lens)
+    if not numbers or lens.count is not None:
+        return lens
+    given, current = lens, lens.current_configuration
+    lens = detached(with_operands(lens, 1))
+    is_held = [any(path.path[-1] == _SIZE and path.path[1] in numbers for path in row.paths) for row in lens.operands]
+    others = tuple(row for row, held in zip(lens.operands, is_held, strict=True) if not held)
+    sizes = clear_semi_diameters(dataclasses.replace(lens, operands=others), numbers)
+    factors = {k: float(sizes[k]) / float(lens.surfaces[k].semi_diameter or math.nan) for k in numbers}
+    factors = {k: factor for k, factor in factors.items() if math.isfinite(factor) and abs(factor - 1) > _SAME}
+    operands = tuple(
+        dataclasses.replace(
+            row, words=tuple(tuple(factors.get(row.number, 1.0) * size for size in sizes) for sizes in row.words)
+        )
+        if held and row.number in factors
+        else row
+        for row, held in zip(lens.operands, is_held, strict=True)
+    )
+    if not factors:
+        return given
+    lens = with_operands(dataclasses.replace(lens, operands=operands), current)
+    return with_thermal_numbers(lens, lens.optimization_data.solves if lens.optimization_data else ())
+
+
+def with_thermal_numbers(lens: Lens, solves: Sequence[Solve]) -> Lens:
+    """The lens whose numbers with thermal pickups are those of their source, expanded."""
+    rules = [rule for rule in solves if rule.kind == "thermal"]
+    operands = list(lens.operands)
+    for source, configuration in dict.fromkeys((rule.source, rule.configuration) for rule in rules):
+        start, here = (with_operands(lens, number) for number in (source, configuration))
+        warmer = temperature_of(here) - temperature_of(start)
+        heights = contact_heights(start, in_contact(start.surfaces))
+        warm = dataclasses.replace(start, surfaces=expanded(start.surfaces, warmer, heights))
+        for rule in rules:
+            if (rule.source, rule.configuration) == (source, configuration) and rule.operand is not None:
+                operands[rule.operand] = taken(operands[rule.operand], warm, configuration - 1)
+    lens = dataclasses.replace(lens, operands=tuple(operands))
+    return with_operands(lens, lens.current_configuration) if rules else lens
 
 
 def semi_diameter_margin(lens: Lens, k: int) -> tuple[float, float]:
@@ -157,6 +212,7 @@ def with_semi_diameters(
     lens: Lens, *, fixed: Sequence[int] | None = None, margin: tuple[float, float] | None = None
 ) -> Lens:
     """As `Lens.with_semi_diameters`."""
+    lens = with_contacts(lens)
     data = lens.optimization_data or OptimizationData(semi_diameters=tuple(fixed_semi_diameters(lens)))
     if margin is not None:
         if len(margin) != 2 or not all(math.isfinite(part) and part >= 0 for part in margin):

@@ -12,6 +12,7 @@ A dash: the lens has no such tolerance.
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from raytrace.system.lens import Lens
@@ -27,6 +28,9 @@ WAVELENGTH = 0.54607
 
 #: Indications that no tolerance of a lens gives: the number, and where it is on a sheet.
 STATED = {"0": "material", "1": "material", "2": "material", "5": "surface", "6": "surface"}
+
+#: The number of a line of a file, in the source of a tolerance.
+_LINE = re.compile(r"(?: line)?:\d+$")
 
 #: Kinds of tolerances that have a place of their own on a sheet; others are lines below the table.
 _PLACED = (
@@ -165,7 +169,8 @@ class Indications:
 
 
 def _first(sources: Iterable[str]) -> Iterable[str]:
-    return (source.partition(";")[0] for source in sources if source)
+    """The first of the sources of each row; lines of a file are that file."""
+    return (_LINE.sub("", source.partition(";")[0]) for source in sources if source)
 
 
 def _largest(row: Tolerance) -> float:

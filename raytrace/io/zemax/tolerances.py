@@ -27,6 +27,9 @@ As OpticStudio's help has them, in the unit of length of the file, degrees and f
 
 Components of a radial decentre and the terms of one irregularity are a group: at its limits, all are at once.
 Every other operand is listed with the reason why it is not read.
+
+`written_lines` are the lines of rows. A comment `raytrace: …` has what they cannot hold: that two components are a
+radial error, and the source of a row.
 """
 
 import dataclasses
@@ -37,6 +40,7 @@ from typing import Any, NamedTuple
 
 from raytrace.io.source import LensFileError, Place, Record, is_number, plain
 from raytrace.io.zemax.surfaces import in_millimetres, type_of, types
+from raytrace.materials.glass import abbe_number
 from raytrace.system.configurations import count
 from raytrace.system.dimensions import power_at
 from raytrace.system.lens import Lens
@@ -58,6 +62,8 @@ _RADIAL = {"TSDR": ("TSDX", "TSDY"), "TEDR": ("TEDX", "TEDY"), "TRLR": ("TRLX", 
 #: Terms of irregularity: the kind of a row, and the power of length of its limits.
 _TERMS = {"TEZI": ("zernike", 1), "TEXI": ("fringe", 0)}
 _SIGMAS = 2.0
+#: Comments on the line above: "raytrace: radial; source" of both components of a radial error without an operand.
+_OURS, _LINKED = "raytrace:", "radial"
 
 #: Operands that are known and not read, with the reason.
 _UNREAD = {
@@ -107,6 +113,15 @@ def read_lines(lens: Lens, lines: Sequence[str], file: str = "", numbers: Sequen
     return reader.result()
 
 
+def _words_of(comment: str) -> tuple[bool, str]:
+    """Whether a row is a component of a radial error, and its source; of a comment that is not ours False and ""."""
+    if not comment.startswith(_OURS):
+        return False, ""
+    words = comment.removeprefix(_OURS).strip()
+    first, _, others = words.partition("; ")
+    return (True, others) if first == _LINKED else (False, words)
+
+
 def _source(record: Record) -> str:
     """File name and line."""
     return f"{PurePath(record.place.file).name}:{record.place.line}"
@@ -130,7 +145,7 @@ class _Reader:
         return ToleranceLines(rows, tuple(self.compensators), self.wavelength, tuple(self.saves), tuple(self.unread))
 
     def read(self, record: Record, comment: str = "") -> None:
-        name = record.keyword
+        name, count = record.keyword, len(self.rows)
         if name == "TWAV":
             self.wavelength = self._positive(record, 2, "test wavelength in µm")
         elif name == "STAT":
@@ -157,6 +172,8 @@ class _Reader:
             self._motion(record, name)
         else:
             self._leave(record, _UNREAD.get(name, "an operand that is not known"))
+        linked, source = _words_of(comment)
+        self.rows[count:] = [_marked(row, linked, source) for row in self.rows[count:]]
 
     def _leave(self, record: Record, reason: str) -> None:
         self.unread.append(f"{record.place}: {record.keyword}: {reason}")
@@ -370,6 +387,189 @@ class _Reader:
             return k, f"a{2 * j}", in_millimetres(1.0, 1 - 2 * j, self.unit)
         self._leave(record, f"parameter {j} of surface {k} is no single number of the lens")
         return None
+
+
+def _marked(row: Tolerance, linked: bool, source: str) -> Tolerance:
+    """A row with what our comment on its line states."""
+    row = dataclasses.replace(row, source=source) if source else row
+    return dataclasses.replace(row, group=f"{row.kind[:-2]}_radial of {row.where}") if linked else row
+
+
+# -- lines of rows -----------------------------------------------------------------------------------------------------
+
+_CODES = {name: code for code, name in _DISTRIBUTIONS.items()}
+_RADIAL_OPERANDS = {"surface_decenter": "TSDR", "element_decenter": "TEDR"}
+_TERM_OPERANDS = {kind: operand for operand, (kind, _) in _TERMS.items()}
+_BREAK_OPERANDS = {name: operand for operand, name in _BREAKS.items()}
+_MOST_PARAMETER = 30  # of PARM
+
+
+class Unwritable(ValueError):
+    """A row or a compensator that has no line."""
+
+
+def written_lines(
+    lens: Lens,
+    rows: Sequence[Tolerance],
+    compensators: Sequence[Compensator] = (),
+    test_wavelength: float = TEST_WAVELENGTH,
+) -> tuple[str, ...]:
+    """The lines of rows of a lens (`OptimizationData.tolerances`): `read_lines` reads them back.
+
+    An Abbe number in % is written as a number. A radial tilt or runout is two lines, each with a comment. Raises
+    Unwritable for a row that OpticStudio has no operand for.
+    """
+    writer = _Writer(lens)
+    writer.line("TWAV", 0, 0, test_wavelength, 0.0)
+    for compensator in compensators:
+        writer.compensator(compensator)
+    groups: dict[str, list[Tolerance]] = {}
+    for n, row in enumerate(rows):
+        groups.setdefault(row.group or str(n), []).append(row)
+    for group in groups.values():
+        writer.rows(group, rows)
+    return tuple(writer.lines)
+
+
+class _Writer:
+    """The lines while rows are written; drawn: the distribution and pivot: the code of the lines above."""
+
+    def __init__(self, lens: Lens) -> None:
+        self.lens, self.lines = lens, list[str]()
+        self.unit = 1.0 if lens.optimization_data is None else lens.optimization_data.unit
+        self.reader = _Reader(lens)
+        self.drawn, self.pivot = ("normal", _SIGMAS), 0
+
+    def line(self, name: str, first: int, second: int, low: float, high: float, third: int = 0) -> None:
+        limits = " ".join(repr(float(limit)) for limit in (low, high))
+        self.lines.append(f"TOL {name} {first} {second} {limits} {third} 0 0")
+
+    def comment(self, row: Tolerance, *, linked: bool = False) -> None:
+        words = "; ".join(([_LINKED] if linked else []) + ([row.source] if row.source else []))
+        if words:
+            self.lines.append(f"TCMM {_OURS} {words}")
+
+    def of_file(self, number: float, power: int) -> float:
+        """A number of the lens in the unit of its file."""
+        return number / in_millimetres(1.0, power, self.unit)
+
+    def rows(self, group: Sequence[Tolerance], every: Sequence[Tolerance]) -> None:
+        """The lines of a group of rows, or of one row."""
+        first = group[0]
+        if first.kind == "irregularity_angle":
+            usual = (first.minimum, first.maximum, first.distribution) == (-90.0, 90.0, "uniform")
+            if not usual or not any(row.kind == "irregularity" and row.surfaces == first.surfaces for row in every):
+                raise Unwritable(f"{first}: a .zmx file has the angle of an irregularity, from -90 to 90 degrees, only")
+            return
+        if first.kind in _TERM_OPERANDS:
+            return self._terms(group)
+        self._statistics(first)
+        name, along = first.kind[:-2], [row.kind[-2:] for row in group]
+        if len(group) == 2 and along == ["_x", "_y"] and name in _RADIAL_OPERANDS:
+            k, last = first.surfaces[0], first.surfaces[-1]
+            whole = [self.of_file(math.sqrt(2) * limit, 1) for limit in (first.minimum, first.maximum)]
+            self.line(_RADIAL_OPERANDS[name], k, last if KINDS[first.kind].elements else 0, whole[0], whole[1])
+            return self.comment(first)
+        if len(group) > 1 and (len(group) > 2 or along != ["_x", "_y"]):
+            raise Unwritable(f"{first}: a group of {len(group)} errors, which no operand of a .zmx file has")
+        for row in group:
+            self._row(row)
+            self.comment(row, linked=len(group) == 2)
+
+    def _statistics(self, row: Tolerance) -> None:
+        if row.distribution not in _CODES or row.distribution == "table":
+            known = ", ".join(name for name in _CODES if name != "table")
+            raise Unwritable(f"{row}: the distribution {row.distribution!r}; a .zmx file has {known}")
+        drawn = row.distribution, row.sigmas if row.distribution == "normal" else _SIGMAS
+        if drawn != self.drawn:
+            self.drawn = drawn
+            self.lines.append(f"TOL STAT {_CODES[drawn[0]]} {drawn[1]:g} 0.0 0.0 0 0 0")
+
+    def _row(self, row: Tolerance) -> None:
+        kind, k, second = KINDS[row.kind], (*row.surfaces, 0)[0], 0
+        name, power = kind.operand, kind.length
+        if row.kind == "operand":
+            name, k, second = "TMCO", (row.operand or 0) + 1, row.configuration
+            power = ToleranceLine(name, (k, second, 0)).power(self.lens) or 0
+        elif row.kind == "parameter":
+            name, second, factor = self._parameter(row)
+            ends = sorted(limit / factor for limit in (row.minimum, row.maximum))
+            return self.line(name, k, second, ends[0], ends[1])
+        elif kind.elements:
+            second = row.surfaces[-1]
+            self._pivot(row)
+        elif row.kind == "thickness":
+            second = k if row.adjust is None else row.adjust
+        elif row.kind == "radius" and row.unit == "%":
+            second, power = 1, 0
+        if not name:
+            raise Unwritable(f"{row}: OpticStudio has no operand for it")
+        part = 1.0
+        if row.kind == "abbe" and row.unit == "%":
+            part = float(abbe_number(self.lens.surfaces[k].glass)) / 100
+        self.line(name, k, second, *(self.of_file(part * limit, power) for limit in (row.minimum, row.maximum)))
+
+    def _pivot(self, row: Tolerance) -> None:
+        """MPVT, where a tilt has another pivot than the lines above."""
+        if not row.kind.startswith("element_tilt"):
+            return
+        first, last = row.surfaces[0], row.surfaces[-1]
+        record = Record("MPVT", (), "", Place("tolerance line"))
+        for code in (self.pivot, 0, 1, 4, 2, 3):
+            self.reader.pivot = code
+            if code in (2, 3) and self.lens.surfaces[first if code == 2 else last].semi_diameter is None:
+                continue
+            if math.isclose(self.reader._pivot(record, first, last), row.pivot, rel_tol=1e-9, abs_tol=1e-9):
+                break
+        else:
+            raise Unwritable(f"{row}: the pivot {row.pivot:g} mm is neither a vertex, an edge nor the middle")
+        if code != self.pivot:
+            self.pivot = code
+            self.line("MPVT", code, 0, 0.0, 0.0)
+
+    def _parameter(self, row: Tolerance) -> tuple[str, int, float]:
+        """Operand, second whole number and scale of a row of a parameter."""
+        k = row.surfaces[0]
+        if self.lens.surfaces[k].is_break and row.parameter in _BREAK_OPERANDS:
+            length = row.parameter in ("x", "y")
+            return _BREAK_OPERANDS[row.parameter], 0, in_millimetres(1.0, int(length), self.unit)
+        return ("TPAR", *self._place(k, row.parameter, str(row)))
+
+    def _place(self, k: int, name: str, words: str) -> tuple[int, float]:
+        """The number j of PARM that holds a parameter, and its scale."""
+        for j in range(1, _MOST_PARAMETER):
+            place = self.reader._name(Record("TPAR", (str(k), str(j)), "", Place("tolerance line")))
+            if place is not None and place[1] == name:
+                return j, place[2]
+        raise Unwritable(f"{words}: {name} of surface {k} is no parameter of a .zmx file")
+
+    def _terms(self, group: Sequence[Tolerance]) -> None:
+        first, terms = group[0], sorted(row.term for row in group)
+        alike = all(
+            (row.kind, row.surfaces, row.maximum) == (first.kind, first.surfaces, first.maximum) for row in group
+        )
+        even = all(row.distribution == "end_points" and row.minimum == -row.maximum for row in group)
+        if not (alike and even and terms == [*range(terms[0], terms[-1] + 1)]):
+            message = "a .zmx file has terms in a row with equal limits ± and the distribution 'end_points'"
+            raise Unwritable(f"{first}: {message}")
+        operand = _TERM_OPERANDS[first.kind]
+        size = self.of_file(math.sqrt(len(terms)) * first.maximum, _TERMS[operand][1])
+        self.line(operand, first.surfaces[0], terms[-1], 0.0, size, terms[0])
+        self.comment(first)
+
+    def compensator(self, item: Compensator) -> None:
+        limits = [0.0 if math.isinf(limit) else limit for limit in (item.minimum, item.maximum)]
+        codes = {name: code for code, name in _COMPENSATORS.items()}
+        if item.operand is not None:
+            name, first, second, scale = "CMCO", item.operand + 1, item.configuration, 1.0
+        elif item.parameter in codes:
+            name, first, second = "COMP", item.surface, codes[item.parameter]
+            scale = in_millimetres(1.0, {"thickness": 1, "curvature": -1, "conic": 0}[item.parameter], self.unit)
+        else:
+            name, first = "CPAR", item.surface
+            second, scale = self._place(item.surface, item.parameter, f"compensator {item}")
+        ends = [limit / scale for limit in limits]
+        self.line(name, first, second, *(ends if scale > 0 else ends[::-1]))
 
 
 # -- lines of a lens that is edited ------------------------------------------------------------------------------------
