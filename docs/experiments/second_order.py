@@ -278,18 +278,19 @@ def table() -> None:
             for optimizer in ("adam", "lbfgs", "lm", "optimize"):
                 own = [seed for seed in map(str, range(SEEDS)) if (start, optimizer, seed) in rows]
                 of_runs = [rows[start, optimizer, seed] for seed in own]
-                gains = [
-                    10 * np.log10(float(rows["spots", "none", seed]["error"]) / float(row["error"]))
-                    for seed, row in zip(own, of_runs, strict=True)
-                ]
-                if not gains:
+                errors = np.array([float(row["error"]) for row in of_runs])
+                spots = np.array([float(rows["spots", "none", seed]["error"]) for seed in own])
+                if not len(errors):
                     continue
+                fail, gains = np.isnan(errors), 10 * np.log10(spots / errors)
                 seconds = np.median([float(row["seconds"]) for row in of_runs])
                 count = np.median([int(row["evaluations"]) for row in of_runs])
-                rate = f"rate {of_runs[0]['rate']}" if optimizer == "adam" else ""
+                said = [f"rate {of_runs[0]['rate']}"] if optimizer == "adam" else []
+                said += [f"{fail.sum()} fail by denser rays"] if fail.any() else []
                 print(
-                    f"{name:20} from {start:6}{optimizer:9} {np.mean(gains):6.2f} dB ({min(gains):6.2f} … "
-                    f"{max(gains):5.2f}) {seconds:6.1f} s {count:5.0f} evaluations, {len(gains)} seeds {rate}"
+                    f"{name:20} from {start:6}{optimizer:9} {np.nanmean(gains):6.2f} dB ({np.nanmin(gains):6.2f} … "
+                    f"{np.nanmax(gains):5.2f}) {seconds:6.1f} s {count:5.0f} evaluations, {len(gains)} seeds "
+                    f"{', '.join(said)}"
                 )
 
 
