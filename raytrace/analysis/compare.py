@@ -592,9 +592,9 @@ def _draw_sums(pair: LensComparison) -> Figure:
     return _finished(figure, pair)
 
 
-def _grid(lens: Lens, of: Lens | None = None) -> GridDistortion:
+def _grid(lens: Lens, scene: Lens | None = None) -> GridDistortion:
     """The grid distortion of a lens, of the objects of another one."""
-    return distortion_grid(lens if of is None else dataclasses.replace(lens, fields=of.fields))
+    return distortion_grid(lens if scene is None else dataclasses.replace(lens, fields=scene.fields))
 
 
 def _at_fields(first: Any) -> dict[str, Any]:
@@ -643,7 +643,7 @@ COMPARED: dict[str, Compared] = {
     "incidence": Compared(incidence, _at_fields, Curves(
         "field", "", "angle of incidence on the sensor (°)", {
         "chief": "chief ray", "upper": "upper rim", "lower": "lower rim"}), summary=True, at_fields=True),
-    "distortion_grid": Compared(_grid, lambda first: {"of": first.lens}, _draw_grids, text="summary"),
+    "distortion_grid": Compared(_grid, lambda first: {"scene": first.lens}, _draw_grids, text="summary"),
     "psf": Compared(psf, lambda first: {"fields": first.fields, "model": first.model}, _draw_psfs, at_fields=True),
     "seidel": Compared(seidel, _at_fields, _draw_sums, summary=True, at_fields=True),
     "thermal": Compared(thermal, lambda first: {"fields": first.fields, "modulation_frequency": float(first.frequency)},

@@ -184,8 +184,8 @@ def _frequency_of_half_contrast(lens: Lens, fields: Tensor) -> float:
     below = torch.nonzero(lowest < 0.5)
     k = int(below[0]) if len(below) else len(lowest) - 1
     fraction = ((lowest[k - 1] - 0.5) / (lowest[k - 1] - lowest[k])).clamp(0, 1) if len(below) and k else 1.0
-    found = frequencies[max(k - 1, 0)] + fraction * (frequencies[k] - frequencies[max(k - 1, 0)])
-    return float(f"{float(found):.2g}")
+    frequency = frequencies[max(k - 1, 0)] + fraction * (frequencies[k] - frequencies[max(k - 1, 0)])
+    return float(f"{float(frequency):.2g}")
 
 
 def _stacked(pairs: Sequence[Tensor | None]) -> Tensor | None:
