@@ -258,6 +258,7 @@ def test_what_has_no_part_or_no_space_is_said(designed_singlets, designed, decoy
         rt.optimize(designed_singlets, **SINGLETS, stock=tmp_path / "none.sqlite")
 
 
+@pytest.mark.slow
 def test_pickups_between_replaced_elements_are_named(designed_singlets, decoys, tmp_path):
     """Those of an element that stays still hold."""
     index = tmp_path / "stock.sqlite"

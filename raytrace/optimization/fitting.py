@@ -107,7 +107,8 @@ class Fitted:
 
     what: "parts" or "test plates"; source: the file of the list; order: a key of ORDERS; steps: of the sequence that is
     kept, its exchanges included; entries: a row for each item, (heading, unit) -> cells; notes: (surfaces, text) of the
-    items without a candidate, with solves that are left out, and of those that the light exceeds; evaluations: of the merit function.
+    items without a candidate, with solves that are left out, and of those that the light exceeds; evaluations: of the
+    merit function.
     """
 
     what: str
