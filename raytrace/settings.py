@@ -53,7 +53,7 @@ ON_REQUEST = ("encircled-energy", "seidel", "as-built", "temperature", "drawings
 COMPARED = (
     *("layout", "spot", "ray-fan", "opd-fan", "wavefront", "mtf", "encircled-energy", "distortion", "field-curvature"),
     *("lateral-colour", "relative-illumination", "rms-over-field", "longitudinal-aberration", "chromatic-focal-shift"),
-    *("seidel", "thermal"),
+    *("incidence", "distortion-grid", "psf", "seidel", "thermal"),
 )
 #: A model, and a start: the optimum of its closed form.
 GAUSSIAN = "gaussian"

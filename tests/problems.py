@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
+from scipy.signal import resample
 
 from raytrace.io import read_lens
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant
 from raytrace.optimization.merit import Evaluation
-from raytrace.optimization.operands.boundaries import ENDS
 from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Fields, Lens, SystemAperture, media
 from raytrace.system.optimization_data import Row
@@ -379,7 +379,8 @@ def random(*shape, seed=0):
 @functools.cache
 def semi_diameters(found) -> list[float]:
     """By torch's trace, surface by surface."""
-    points = torch.tensor(ENDS, dtype=torch.float64).T
+    angles = torch.arange(12, dtype=torch.float64) * (math.pi / 6)
+    points = torch.stack([angles.sin(), angles.cos()])
     percent, length = found.optimization_data.semi_diameter_margin
     sizes = [0.0 if found.surfaces[0].semi_diameter is None else found.surfaces[0].semi_diameter]
     for k in range(1, len(found.surfaces)):
@@ -393,7 +394,10 @@ def semi_diameters(found) -> list[float]:
                 rays = rays_of_field(found, field, vignette(found, field, points), wavelength=wavelength)
                 indices = media(found, wavelength)[: k + 1]
                 rays = trace_surfaces(found.surfaces[1 : k + 1], rays, indices=indices, wavelength=wavelength)
-                heights += [height for height in torch.hypot(*rays.position[:2])[rays.valid]]
+                each = torch.hypot(*rays.position[:2])[rays.valid]
+                if len(each) == 12:  # all arrive
+                    each = torch.cat([each, torch.from_numpy(resample(each.numpy() ** 2, 180)).sqrt()])
+                heights += [*each]
         bare = k in (found.stop, len(found.surfaces) - 1)
         sizes.append(float(max(heights)) * (1 if bare else 1 + percent / 100) + (0 if bare else length))
     return sizes

@@ -41,6 +41,49 @@ def test_columns_are_those_of_both_lenses_and_their_difference(name, lenses):
         np.testing.assert_array_equal(frame[f"{column}_change"], frame[f"{column}_2"] - frame[f"{column}_1"])
 
 
+def test_angles_of_incidence_are_those_on_the_sensor(lenses):
+    frame = rt.compare(*lenses, "incidence").to_frame()
+    for end, lens in zip(("_1", "_2"), lenses, strict=True):
+        summary = rt.incidence(lens).summary()
+        for name in ("chief", "upper", "lower", "height"):
+            np.testing.assert_array_equal(frame[f"{name}{end}"], summary[name].flatten().numpy())
+    figure = rt.compare(*lenses, "incidence").plot()
+    assert {line.get_color() for line in figure.axes[0].lines} >= {*COLOURS}
+
+
+def test_grids_are_of_the_objects_of_the_first_lens(lenses):
+    """Of a lens with larger fields too; on one scale, and exaggerated alike."""
+    other = dataclasses.replace(lenses[1], fields=rt.read_lens("double_gauss").fields)
+    comparison = rt.compare(lenses[0], other, "distortion_grid")
+    assert torch.equal(comparison.first.fields, comparison.second.fields)
+    expected = rt.distortion_grid(lenses[1])
+    assert torch.allclose(comparison.second.actual, expected.actual, rtol=1e-12)
+    assert len(comparison.to_frame()) == 121
+    first, second = (100 * float(grid.largest()) for grid in (comparison.first, expected))
+    row = str(comparison).splitlines()[-1].split()
+    assert [float(word) for word in row[1:]] == pytest.approx([first, second, second - first], rel=1e-5)
+    figure = comparison.plot()
+    assert len({(panel.get_xlim(), panel.get_ylim()) for panel in figure.axes}) == 1
+    times = float(figure.get_suptitle().split("×")[1])
+    actual = comparison.first.ideal + times * (comparison.first.actual - comparison.first.ideal)
+    drawn = [line for line in figure.axes[0].lines if line.get_color() == COLOURS[0]]
+    assert max(np.nanmax(line.get_ydata(), initial=0.0) for line in drawn) == pytest.approx(float(actual[1].max()))
+
+
+@pytest.mark.slow
+def test_psfs_have_one_model_one_window_and_one_scale_a_row(lenses):
+    comparison = rt.compare(*lenses, "psf", fields=[0, 8])
+    assert comparison.first.model == comparison.second.model
+    expected = rt.psf(lenses[1], comparison.first.model, fields=[0, 8])
+    np.testing.assert_array_equal(comparison.to_frame()["sigma_y_um_2"], expected.to_frame()["sigma_y_um"])
+    images = [image for panel in comparison.plot().axes for image in panel.images]
+    assert len(images) == 4
+    assert len({tuple(image.get_extent()) for image in images}) == 1
+    for one, two in (images[:2], images[2:]):
+        assert one.get_clim() == two.get_clim()
+        assert one.get_clim()[1] == max(float(image.get_array().max()) for image in (one, two))
+
+
 def test_first_order_data_stand_beside_the_layouts(lenses):
     comparison = rt.compare(*lenses)
     table = comparison.to_frame().set_index("quantity")

@@ -258,6 +258,19 @@ def test_what_has_no_part_or_no_space_is_said(designed_singlets, designed, decoy
         rt.optimize(designed_singlets, **SINGLETS, stock=tmp_path / "none.sqlite")
 
 
+@pytest.mark.slow
+def test_pickups_between_replaced_elements_are_named(designed_singlets, decoys, tmp_path):
+    """Those of an element that stays still hold."""
+    index = tmp_path / "stock.sqlite"
+    rt.stock_index(decoys, index)
+    words = SINGLETS["vary"].replace("curvature", "curvature:1-3 curvature:4=-curvature:1", 1)
+    options = SINGLETS | {"vary": words}
+    with pytest.warns(rt.NotFitted, match=r"surfaces 1-2: left out with the element: solve curvature of surface 4 ="):
+        fitted = rt.optimize(designed_singlets, **options, stock=index, cycles=2)
+    assert [surfaces for surfaces, text in fitted.fitted.notes if "left out" in text] == ["1-2", "3-4"]
+    assert "left out with the element" in str(fitted)
+
+
 def test_fixed_elements_stay(designed_singlets, decoys, tmp_path):
     rt.stock_index(decoys, tmp_path / "stock.sqlite")
     how = SINGLETS | {"vary": "curvature:3,4 thickness:2,4"}

@@ -62,6 +62,16 @@ def test_the_analysis_is_a_table_a_figure_and_a_document(shown, tmp_path):
     assert (tmp_path / "thermal.csv").read_text().startswith("temperature,effective_focal_length")
 
 
+def test_the_default_frequency_is_that_of_half_contrast_in_focus():
+    lens = rt.lens([dict(radius=60.0, thickness=5.0, glass="N-BK7"), dict(radius=-60.0, thickness=57.0)], stop=1,
+                   entrance_pupil_diameter=12.0, fields=[0], wavelengths=[0.5876])  # fmt: skip
+    shown = rt.thermal(lens, [15, 25], samples=3)
+    assert float(shown.modulation[1, 1]) == pytest.approx(0.5, abs=0.02)  # of a frequency of two digits
+    curves = rt.mtf(rt.focus(lens).lens, float(shown.frequency))
+    lowest = min(float(curves.tangential.min()), float(curves.sagittal.min()))
+    assert lowest == pytest.approx(0.5, abs=0.02)
+
+
 def test_the_command_prints_the_analysis(command):
     code, out, err = command(
         *("thermal", "cemented_achromat", "--range", -10, 40, "--mount", "titanium", "--samples", 2, "--json"),

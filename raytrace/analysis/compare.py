@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,9 @@ from raytrace.analysis.chief import distortion, field_curvature, lateral_colour
 from raytrace.analysis.chromatic import chromatic_focal_shift
 from raytrace.analysis.encircled import encircled_energy
 from raytrace.analysis.fans import opd_fan, ray_fan
+from raytrace.analysis.grid import GridDistortion, distortion_grid, draw_grid
 from raytrace.analysis.illumination import relative_illumination
+from raytrace.analysis.incidence import incidence
 from raytrace.analysis.layout import draw_layout, layout, on_one_scale
 from raytrace.analysis.longitudinal import longitudinal_aberration
 from raytrace.analysis.mtf import frequency_range, mtf
@@ -36,18 +38,39 @@ from raytrace.analysis.spot_diagram import (
     wavelength_handles,
 )
 from raytrace.analysis.thermal import thermal
-from raytrace.analysis.wavefronts import WavefrontMap, diverging, wavefront
+from raytrace.analysis.wavefronts import WavefrontMap, diverging, draw_map, wavefront
 from raytrace.io import as_lens
 from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, Table, flat
-from raytrace.plotting.style import GREY, Axes, Figure, array, fill, legend_entry, new_figure, number_text, styled
+from raytrace.plotting.style import (
+    GREY,
+    Axes,
+    Figure,
+    array,
+    fill,
+    legend_entry,
+    new_figure,
+    number_text,
+    round_length,
+    styled,
+)
+from raytrace.psf_models.figures import DECADES, close_up_of, panels, row_labels, windows, worded
+from raytrace.psf_models.models import psf
+from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, field_points, with_wavelengths
 from raytrace.tracing.lens_report import FIRST_ORDER_LINES, Info
 from raytrace.words import RaytraceError, did_you_mean, option
 
 COLOURS, WIDTHS = ("#0072B2", "#D55E00"), (1.9, 1.0)  # of the first and the second lens, also where they coincide
-_HEADS = ("field_x", "field_y", "wavelength", "frequency", "radius", "pupil", "temperature", "quantity")
-_NO_VALUES = ("tangential_limit", "sagittal_limit", "rays", "projected_solid_angle", "noll", "coefficient")
+_HEADS = (
+    *("field_x", "field_y", "wavelength", "frequency", "radius", "pupil", "temperature", "quantity"),
+    *("surface", "object_distance"),
+)
+_NO_VALUES = (
+    *("tangential_limit", "sagittal_limit", "rays", "projected_solid_angle", "noll", "coefficient"),
+    *("fringe", "error"),
+)
+_SHOWN = 0.1  # of the size of a grid: the largest distortion that is drawn exaggerated
 _ACROSS = 3  # panels in a row
 _FREQUENCIES = 41
 
@@ -62,7 +85,8 @@ class Curves:
 
     x: the column of the abscissa; curves: columns and their labels; factor: of the curves, x_factor: of the abscissa;
     panels: a panel for each of these, "field", "wavelength" or "curve"; the others have a dash each; upright: the
-    abscissa is drawn upwards; limits: of the curves; is_shared: whether all panels have one scale of the curves.
+    abscissa is drawn upwards; limits: of the curves; is_shared: whether all panels have one scale of the curves; tops:
+    ends of the scales of curves that begin at 0.
     """
 
     x: str
@@ -75,18 +99,20 @@ class Curves:
     upright: bool = False
     limits: tuple[float | None, float | None] = (None, None)
     is_shared: bool = True
+    tops: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
     """An analysis of both lenses: the function; the options of the second call by the first result; its curves, or the
     function that draws its figure; summary: whether the table is the summary of the results;
-    at_fields: whether it takes fields."""
+    text: what the text has of it, "all" or the "summary"; at_fields: whether it takes fields."""
 
     make: Callable[..., Result]
     alike: Callable[[Any], dict[str, Any]]
     draws: Curves | Callable[["LensComparison"], Figure]
     summary: bool = False
+    text: Literal["all", "summary"] = "all"
     at_fields: bool = False
 
 
@@ -118,22 +144,23 @@ class LensComparison(Result):
                         for k, (end, label) in enumerate(ends)]  # fmt: skip
         return [*columns, Column("quantity", form="<"), Column("unit", form="<", heading="unit or definition")]
 
-    def _tables_of_both(self) -> list[dict[str, Tensor]]:
+    def _of_both(self, *, brief: bool = False) -> list[dict[str, Tensor]]:
+        """The tables of both results; brief: their summaries."""
         if self.analysis == "layout":
             return [_first_order(lens) for lens in (self.lens, self.other)]
-        take = "summary" if COMPARED[self.analysis].summary else "columns"
+        take = "summary" if brief or COMPARED[self.analysis].summary else "columns"
         return [getattr(result, take)() for result in (self.first, self.second)]
 
     def _values(self) -> list[str]:
-        return [name for name in self._tables_of_both()[0] if name not in _HEADS and name not in _NO_VALUES]
+        tables = [self._of_both()[0], *([self._of_both(brief=True)[0]] if self._is_brief else [])]
+        return [*dict.fromkeys(name for table in tables for name in table if name not in (*_HEADS, *_NO_VALUES))]
+
+    @property
+    def _is_brief(self) -> bool:
+        return COMPARED[self.analysis].text == "summary"
 
     def columns(self) -> dict[str, Tensor]:
-        first, second = self._tables_of_both()
-        table = {name: column for name, column in first.items() if name in _HEADS}
-        for name in self._values():
-            single, other = first[name], second[name]
-            table |= {f"{name}_1": single, f"{name}_2": other, f"{name}_change": other - single}
-        return table | ({"unit": table["quantity"]} if "quantity" in table else {})
+        return _differences(*self._of_both())
 
     def column(self, name: str) -> Column:
         known = next((column for column in self.COLUMNS if column.name == name), None)
@@ -164,7 +191,7 @@ class LensComparison(Result):
         title = [f"{self.analysis.replace('_', ' ')}: A {self.names[0]}, B {self.names[1]}"]
         if not torch.equal(self.lens.wavelengths, self.other.wavelengths):
             title.append("wavelengths of both: those of A")
-        columns: dict[str, Tensor] = self.columns()
+        columns = _differences(*self._of_both(brief=self._is_brief))
         every = getattr(self.first, "EVERY", 1)
         tables = [Table(columns, title)]
         if every > 1 and isinstance(self.first, Analysis):
@@ -184,6 +211,16 @@ class LensComparison(Result):
         """Both lenses in one figure of one scale: the first in blue, the second in orange, or one above the other."""
         draws = COMPARED[self.analysis].draws
         return _curves(self, draws) if isinstance(draws, Curves) else draws(self)
+
+
+def _differences(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The columns of two tables, and the second less the first."""
+    table = {name: column for name, column in first.items() if name in _HEADS}
+    for name in first:
+        if name not in _HEADS and name not in _NO_VALUES:
+            single, other = first[name], second[name]
+            table |= {f"{name}_1": single, f"{name}_2": other, f"{name}_change": other - single}
+    return table | ({"unit": table["quantity"]} if "quantity" in table else {})
 
 
 def compare(
@@ -266,7 +303,8 @@ def _first_order(lens: Lens) -> dict[str, Tensor]:
 def _curves(pair: LensComparison, plot: Curves) -> Figure:
     """The curves of both lenses: a panel for each of its `panels`, one colour a lens, dashes for the rest."""
     results = [getattr(result, "drawn", lambda result=result: result)() for result in (pair.first, pair.second)]
-    tables = [flat({**result.columns(), **_summary(result)}) for result in results]
+    is_summary = COMPARED[pair.analysis].summary
+    tables = [flat(result.summary() if is_summary else {**result.columns(), **_summary(result)}) for result in results]
     keys = {"field": ("field_x", "field_y"), "wavelength": ("wavelength",)}
     dims = [dim for dim, names in keys.items() if names[0] in tables[0] and not (dim == "field" and plot.x == "field")]
     if plot.x == "wavelength":
@@ -315,8 +353,11 @@ def _curves(pair: LensComparison, plot: Curves) -> Figure:
     for panel in panels[len(places) :]:
         panel.axis("off")
     extent = _line(tables[0], dict(zip([*shown, *dashed], [*places[0], *styles[0]], strict=True)), keys, plot)[0]
-    for panel in panels[: len(places)]:
+    for panel, place in zip(panels, places, strict=False):
         (panel.set_ylim if plot.upright else panel.set_xlim)(np.nanmin(extent), np.nanmax(extent) or 1.0)
+        name = place[-1][0] if shown and shown[-1] == "curve" else ""
+        if name in plot.tops:
+            panel.set_ylim(0, plot.tops[name])
         if plot.limits != (None, None):
             panel.set_ylim(*plot.limits)
         if shape[1] > 1:
@@ -371,7 +412,12 @@ def _word(dim: str, part: tuple, labels: Mapping[str, Mapping], plot: Curves) ->
 
 
 def _finished(
-    figure: Figure, pair: LensComparison, dashes: Sequence[tuple[str, Dash]] = (), *, coloured: bool = True
+    figure: Figure,
+    pair: LensComparison,
+    dashes: Sequence[tuple[str, Dash]] = (),
+    *,
+    coloured: bool = True,
+    dash_colour: str = "#404040",
 ) -> Figure:
     """The figure with its title, and a legend of lenses and dashes."""
     handles = (
@@ -382,13 +428,14 @@ def _finished(
         if coloured
         else []
     )
-    handles += [legend_entry(word, color="#404040", linestyle=dash) for word, dash in dashes]
+    handles += [legend_entry(word, color=dash_colour, linestyle=dash) for word, dash in dashes]
     if handles:
         width = 12.0 * figure.get_figwidth()
         columns = max(1, min(len(handles), int(width / (6 + max(len(str(h.get_label())) for h in handles)))))
         figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     titles = {"rms_over_field": "RMS over the field", "mtf": "MTF", "opd_fan": "OPD fans", "ray_fan": "ray fans"}
-    titles["seidel"] = "sums of the Seidel aberrations"
+    titles |= {"seidel": "sums of the Seidel aberrations", "distortion_grid": "grid distortion"}
+    titles |= {"thermal": "over temperature", "incidence": "angles of incidence on the sensor"}
     figure.suptitle(titles.get(pair.analysis, pair.analysis.replace("_", " ")), fontweight="bold", fontsize=10)
     return figure
 
@@ -459,9 +506,7 @@ def _draw_maps(pair: LensComparison) -> Figure:
     for f, k in ((f, k) for f in range(len(labels)) for k in (0, 1)):
         panel = grid[2 * (f // 4) + k, f % 4]
         panel.axis("on")
-        drawn = panel.imshow(maps[k][f], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
-        panel.set(xticks=[], yticks=[])
-        panel.spines[:].set_visible(False)
+        drawn = draw_map(panel, maps[k][f], colours, scale)
         rms, strehl = (number_text(float(v[f, w]), 3) for v in (both[k].rms, both[k].strehl))
         panel.set_xlabel(f"RMS {rms}\nStrehl {strehl}", fontsize=7.5, color=GREY)
         panel.set_title(labels[f] if k == 0 else "")
@@ -474,6 +519,62 @@ def _draw_maps(pair: LensComparison) -> Figure:
     words = f"wavefront, {wavelength} nm\nA: {pair.names[0]}\nB: {pair.names[1]}"
     figure.suptitle(fill(words, figure.get_figwidth(), 9, bold=True), fontweight="bold", fontsize=9)
     return figure
+
+
+def _draw_grids(pair: LensComparison) -> Figure:
+    """The grids of both lenses side by side on one scale of mm, each over that without distortion."""
+    figure = new_figure(8.4, 4.9)
+    grids = (pair.first, pair.second)
+    axes = [*figure.subplots(1, 2, sharex=True, sharey=True)]
+    largest = max(float(grid.largest().abs()[0]) for grid in grids)
+    times = min(max(round_length(_SHOWN / max(largest, 1e-9)), 1.0), 1000.0)
+    for panel, letter, colour, grid in zip(axes, "AB", COLOURS, grids, strict=True):
+        draw_grid(panel, grid, colour, times)
+        panel.set_title(f"{letter}: largest {number_text(100 * float(grid.largest()[0]), 3)} %")
+        panel.set(xlabel="x on the sensor (mm)", aspect="equal")
+    axes[0].set_ylabel("y on the sensor (mm)")
+    finished = _finished(figure, pair, [("without distortion", "-")], dash_colour=GREY)
+    if times > 1:
+        finished.suptitle(f"grid distortion, drawn × {times:g}", fontweight="bold", fontsize=10)
+    return finished
+
+
+def _draw_psfs(pair: LensComparison) -> Figure:
+    """The light of both lenses, a row for each field, in windows of one size, a row on one scale of brightness."""
+    both = [psfs for psfs in (pair.first, pair.second) if isinstance(psfs, Psf)]
+    size = max(float(windows(psfs)[0].max()) for psfs in both)
+    light = np.stack([array(close_up_of(psfs, size).light)[0] for psfs in both], 1)  # field × lens × N × N
+    notes = [[f"σ {sx:.3g}, {sy:.3g} µm" for sx, sy in row] for row in _widths(both)]
+    labels = row_labels(both[0])
+    peaks = light.max((1, 2, 3)).tolist()
+    halves = np.full(light.shape[:2], size)
+    figure, _ = panels(light, halves, ["A", "B"], labels, notes, log=True, peaks=peaks)
+    lines = [
+        f"A: {pair.names[0]}",
+        f"B: {pair.names[1]}",
+        f"windows of {2e3 * size:.3g} µm about the centroid",
+        f"each row {10.0**-DECADES:g} to 1 of the higher peak, logarithmic",
+        "σ: of the rays, along x and y",
+    ]
+    return worded(figure, f"{both[0].model} PSF", ["\n".join(lines)])
+
+
+def _widths(both: Sequence[Psf]) -> list[list[tuple[float, float]]]:
+    """σ_x and σ_y in µm of the rays, by field and lens."""
+    sigmas = [1e3 * psfs.ray_covariance[::2, 0].clamp_min(0.0).sqrt().detach() for psfs in both]  # (2, F)
+    return [[(float(each[0, f]), float(each[1, f])) for each in sigmas] for f in range(sigmas[0].shape[1])]
+
+
+def _draw_thermal(pair: LensComparison) -> Figure:
+    """Focus shift, and spot radius and lowest modulation with the fixed sensor, over temperature."""
+    cycles = f"{float(pair.first.frequency):.4g}"
+    curves = {
+        "focus_shift_um": "focus shift (µm)",
+        "rms_fixed_um": "RMS spot radius, sensor fixed (µm)",
+        "modulation_fixed": f"lowest modulation at\n{cycles} cycles/mm, sensor fixed",
+    }
+    tops = {"rms_fixed_um": None, "modulation_fixed": 1.0}
+    return _curves(pair, Curves("temperature", "temperature (°C)", "", curves, ("curve",), is_shared=False, tops=tops))
 
 
 def _draw_sums(pair: LensComparison) -> Figure:
@@ -489,6 +590,11 @@ def _draw_sums(pair: LensComparison) -> Figure:
     panel.axhline(0, color=GREY, linewidth=0.6)
     panel.set_ylabel(f"sum over the surfaces ({pair.first.unit})")
     return _finished(figure, pair)
+
+
+def _grid(lens: Lens, scene: Lens | None = None) -> GridDistortion:
+    """The grid distortion of a lens, of the objects of another one."""
+    return distortion_grid(lens if scene is None else dataclasses.replace(lens, fields=scene.fields))
 
 
 def _at_fields(first: Any) -> dict[str, Any]:
@@ -534,9 +640,12 @@ COMPARED: dict[str, Compared] = {
     "chromatic_focal_shift": Compared(chromatic_focal_shift, lambda first: {}, Curves(
         "wavelength", "wavelength (µm)", "paraxial focus, from that of the primary wavelength (mm)", {"shift": "focus"},
         upright=True)),
+    "incidence": Compared(incidence, _at_fields, Curves(
+        "field", "", "angle of incidence on the sensor (°)", {
+        "chief": "chief ray", "upper": "upper rim", "lower": "lower rim"}), summary=True, at_fields=True),
+    "distortion_grid": Compared(_grid, lambda first: {"scene": first.lens}, _draw_grids, text="summary"),
+    "psf": Compared(psf, lambda first: {"fields": first.fields, "model": first.model}, _draw_psfs, at_fields=True),
     "seidel": Compared(seidel, _at_fields, _draw_sums, summary=True, at_fields=True),
     "thermal": Compared(thermal, lambda first: {"fields": first.fields, "modulation_frequency": float(first.frequency)},
-        Curves("temperature", "temperature (°C)", "", {
-            "focus_shift_um": "focus shift (µm)", "rms_fixed_um": "RMS spot radius, fixed (µm)",
-            "modulation_fixed": "lowest modulation, fixed"}, ("curve",), is_shared=False), at_fields=True),
+        _draw_thermal, at_fields=True),
 }  # fmt: skip

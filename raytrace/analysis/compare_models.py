@@ -13,7 +13,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Result, Table, axis, number, numbers
 from raytrace.maths.sampling import Grid, grid
 from raytrace.plotting.style import Figure, array, styled
-from raytrace.psf_models.figures import brightness, panels, window, worded
+from raytrace.psf_models.figures import brightness, distance_text, panels, window, worded
 from raytrace.psf_models.models import MODELS, PIXEL, SIZE, Model, NotConverged, psf
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, media, with_sensor_distance, with_wavelengths
@@ -189,9 +189,9 @@ class Comparison(Result):
             for name, psfs in zip(self.models, self.psfs, strict=True)
         ]
         grid = self.psfs[-1].grid
-        pitch, distances = float(grid.pitch), self.object_distances.tolist()
+        pitch, headings = float(grid.pitch), [distance_text(distance) for distance in self.object_distances.tolist()]
         half = 0.5 * pitch * grid.columns
-        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+        figure, _ = panels(kernels, [[half] * len(headings)] * len(labels), headings, labels, notes, log)
         title = ": ".join(filter(None, (self.psfs[-1].lens.name, self.sensor)))
         return worded(
             figure, title, [window(grid), brightness(log), f"Δ: relative L¹ difference from {self.models[-1]}"]

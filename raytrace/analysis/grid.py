@@ -17,7 +17,7 @@ from raytrace.analysis.setting import (
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value
 from raytrace.maths.result import Column, Table, axis, masked
-from raytrace.plotting.style import GREY, Figure, array, field_colour, new_figure, number_text, styled
+from raytrace.plotting.style import GREY, Axes, Figure, array, field_colour, new_figure, number_text, styled
 from raytrace.system.lens import Lens, with_wavelengths
 from raytrace.tracing.launch import is_at_infinity, warn_of_filling
 from raytrace.tracing.spot import chief_points
@@ -88,18 +88,23 @@ class GridDistortion(Analysis):
     @styled
     def draw(self, *, exaggerate: float = 1.0) -> Figure:
         """The ideal grid in grey, the real one over it, its distortion exaggerated; of the first wavelength."""
-        ideal, actual = (array(points[:, 0]) for points in (self.ideal, self.actual))
-        actual = np.where(array(self.valid[0]).astype(bool), ideal + exaggerate * (actual - ideal), np.nan)
         figure = new_figure(4.6, 5.0)
         panel = figure.add_subplot(aspect="equal")
-        rays = "chief rays" + (f", distortion × {exaggerate:g}" if exaggerate != 1 else "")
-        for points, label, colour, width in ((ideal, "ideal", GREY, 0.8), (actual, rays, field_colour(0), 1.2)):
-            panel.plot(*points, color=colour, linewidth=width)
-            panel.plot(*points.transpose(0, 2, 1), color=colour, linewidth=width)
-            panel.plot([], [], color=colour, linewidth=width, label=label)
+        draw_grid(panel, self, field_colour(0), exaggerate)
         panel.set(xlabel="x on the sensor (mm)", ylabel="y on the sensor (mm)")
         largest = number_text(100 * float(self.largest()[0]), 3)
         return finished(panel, self, f"grid distortion, largest {largest} % ({wavelength_label(self, 0)})", 2)
+
+
+def draw_grid(panel: Axes, grid: GridDistortion, colour: str, exaggerate: float = 1.0) -> None:
+    """The ideal grid in grey and the real one over it, of the first wavelength; its distortion exaggerated."""
+    ideal, actual = (array(points[:, 0]) for points in (grid.ideal, grid.actual))
+    actual = np.where(array(grid.valid[0]).astype(bool), ideal + exaggerate * (actual - ideal), np.nan)
+    rays = "chief rays" + (f", distortion × {exaggerate:g}" if exaggerate != 1 else "")
+    for points, label, ink, width in ((ideal, "ideal", GREY, 0.8), (actual, rays, colour, 1.2)):
+        panel.plot(*points, color=ink, linewidth=width)
+        panel.plot(*points.transpose(0, 2, 1), color=ink, linewidth=width)
+        panel.plot([], [], color=ink, linewidth=width, label=label)
 
 
 def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11) -> GridDistortion:

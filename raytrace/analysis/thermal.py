@@ -23,6 +23,7 @@ from raytrace.tracing.paraxial import first_order
 from raytrace.words import option
 
 _RINGS = SAMPLINGS["gauss"][2]
+_FREQUENCIES = 41
 #: What `thermal` computes over temperature.
 MEASURES = ("focus", "rms", "mtf")
 _LARGER = {"fixed": INK, "refocused": "#0072B2"}
@@ -143,9 +144,9 @@ def thermal(
     mount: material of all spaces without a stated expansion and of the way to the sensor, of `materials.MOUNTS`, or
     1e-6/K; samples: temperatures from the lowest to the highest; measure: those of "focus", "rms" and "mtf" that are
     computed, the focal length and the focus always; the MTF takes most of the time; modulation_frequency: cycles/mm, by
-    default half of those that `rt.mtf` shows; fields: y or (x, y), by default the lens's own, of equal weight;
-    wavelengths: µm. Focus and spots are those of least RMS radius over fields and wavelengths. Differentiable, but for
-    the modulation.
+    default that of a lowest modulation of 0.5 in focus at its own temperature; fields: y or (x, y), by default the
+    lens's own, of equal weight; wavelengths: µm. Focus and spots are those of least RMS radius over fields and
+    wavelengths. Differentiable, but for the modulation.
     Warns NoThermalCoefficients. Raises ValueError for an unknown mount or a range that is none.
     """
     if len(temperatures) != 2 or not temperatures[0] < temperatures[1]:
@@ -161,7 +162,7 @@ def thermal(
     lens.at(temperature=celsius[(celsius - temperature_of(lens)).abs().argmax()])  # warns of glasses, once
     focused, frequency = _focused(lens, fields), modulation_frequency if "mtf" in measures else None
     if "mtf" in measures and frequency is None:
-        frequency = float(frequency_range(focused, fields, 3)[1])
+        frequency = _frequency_of_half_contrast(focused, fields)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NoThermalCoefficients)
         nominal = focused.surfaces[-2].thickness - lens.surfaces[-2].thickness
@@ -177,6 +178,19 @@ def thermal(
     return Thermal(
         lens, fields, celsius, focal, back, sensor, shift, rms, modulation, cycles, depth.reshape(()), expansion
     )  # fmt: skip
+
+
+def _frequency_of_half_contrast(lens: Lens, fields: Tensor) -> float:
+    """The lowest frequency, cycles/mm to two digits, at which a field has a modulation of 0.5, tangential or sagittal;
+    if none is that low, the highest one that `rt.mtf` shows."""
+    frequencies = frequency_range(lens, fields, _FREQUENCIES)
+    with torch.no_grad():
+        lowest = torch.minimum(*modulations(aligned(lens, 3), fields, frequencies)).amin(0)
+    below = torch.nonzero(lowest < 0.5)
+    k = int(below[0]) if len(below) else len(lowest) - 1
+    fraction = ((lowest[k - 1] - 0.5) / (lowest[k - 1] - lowest[k])).clamp(0, 1) if len(below) and k else 1.0
+    frequency = frequencies[max(k - 1, 0)] + fraction * (frequencies[k] - frequencies[max(k - 1, 0)])
+    return float(f"{float(frequency):.2g}")
 
 
 def _stacked(pairs: Sequence[Tensor | None]) -> Tensor | None:

@@ -20,7 +20,7 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import placed, value
 from raytrace.maths.result import Column, Table
 from raytrace.maths.sampling import gauss_rings
-from raytrace.plotting.style import GREY, INK, Figure, new_figure, number_text, styled
+from raytrace.plotting.style import GREY, INK, Axes, Figure, new_figure, number_text, styled
 from raytrace.psf_models.strehl import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene, symmetry
@@ -29,6 +29,7 @@ from raytrace.words import calling_level
 
 if TYPE_CHECKING:  # slow to load
     from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.image import AxesImage
 
 _RINGS = 14, 56
 _GRID = 127
@@ -110,9 +111,7 @@ class WavefrontMap(Analysis):
         colours, scale = diverging(opd)
         for row, w in itertools.product(range(len(labels)), range(count)):
             panel = axes[row, w]
-            drawn = panel.imshow(opd[row, w], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
-            panel.set(xticks=[], yticks=[])
-            panel.spines[:].set_visible(False)
+            drawn = draw_map(panel, opd[row, w], colours, scale)
             rms, valley, strehl = (
                 number_text(float(v[row, w]), 3) for v in (self.rms, self.peak_to_valley, self.strehl)
             )
@@ -129,6 +128,17 @@ class WavefrontMap(Analysis):
         bar.set_label("OPD (waves)")
         bar.outline.set_visible(False)
         return finished(grid[0, 0], self, f"wavefront, {wavelength_label(self, 0)}" if flows else "wavefront")
+
+
+def draw_map(panel: Axes, opd: np.ndarray, colours: "ListedColormap", scale: "Normalize") -> "AxesImage":
+    """A map (N, N) of waves over the pupil, without the single points that lie on the rim of the pupil itself."""
+    half = len(opd) / (len(opd) - 1)  # points at the ends of the axes are middles of pixels
+    line = np.linspace(-1, 1, len(opd))
+    inside = np.hypot(line, line[:, None]) < 1 - 1e-9
+    opd = np.where(inside, opd, np.nan)
+    panel.set(xticks=[], yticks=[])
+    panel.spines[:].set_visible(False)
+    return panel.imshow(opd, origin="lower", cmap=colours, norm=scale, extent=(-half, half, -half, half))
 
 
 def wavefront(

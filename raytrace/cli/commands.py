@@ -1041,7 +1041,8 @@ Analyses: {", ".join(COMPARED)}; layout has first-order data.""",
         row("samples", "temperatures", default=9),
         Option("measure", str.lower, "WORD", "what is computed besides the focal length: focus, rms, mtf (default: "
             "all; the MTF takes most of the time)", nargs="+", choices=("focus", "rms", "mtf")),
-        Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: half of those of mtf)"),
+        Option("modulation_frequency", positive_finite, "F", "of the MTF, cycles/mm (default: that of a lowest "
+            "modulation of 0.5 in focus at its own temperature)"),
     ),
     _command(
         "depth-of-field",

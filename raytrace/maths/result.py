@@ -288,3 +288,15 @@ def object_text(distance: float) -> str:
     if math.isinf(distance):
         return "infinity"
     return (f"{distance / 1000:.6g} m" if abs(distance) >= 1e4 else f"{distance:.6g} mm").replace("-", "−")
+
+
+def quantity_text(figure: float, word: str | None = None) -> str:
+    """A number of first-order data as it is printed; word: of one that is infinite in practice."""
+    if word:
+        return word
+    return "-" if math.isnan(figure) else "infinite" if math.isinf(figure) else f"{figure + 0.0:.9g}"
+
+
+def quantity_remark(figure: float, word: str | None = None) -> str:
+    """The number of a quantity that is infinite in practice, behind its unit."""
+    return f"; {figure:.4g} mm by first-order data" if word and math.isfinite(figure) else ""

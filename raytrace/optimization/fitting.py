@@ -45,7 +45,8 @@ ORDERS = {"worst": "the item that raises the merit most first", "best": "the ite
 
 
 class NotFitted(RaytraceWarning):
-    """A radius without a test plate, an element without a part, or a part that is smaller than the light."""
+    """A radius without a test plate, an element without a part, a part that is smaller than the light, or solves and
+    pickups that do not hold for a part."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,8 @@ class Fitted:
 
     what: "parts" or "test plates"; source: the file of the list; order: a key of ORDERS; steps: of the sequence that is
     kept, its exchanges included; entries: a row for each item, (heading, unit) -> cells; notes: (surfaces, text) of the
-    items without a candidate, and of those that the light exceeds; evaluations: of the merit function.
+    items without a candidate, with solves that are left out, and of those that the light exceeds; evaluations: of the
+    merit function.
     """
 
     what: str
@@ -223,6 +225,10 @@ class Fit(ABC):
         """Notes of the items that the light exceeds at the end."""
         return []
 
+    def left_out(self, design: Design) -> list[tuple[str, str]]:
+        """Notes of the solves and pickups that do not hold for the candidates."""
+        return []
+
     def fixed(self, design: Design) -> set[tuple[int, str]]:
         """Addresses of the variables of the design that its candidates fix."""
         return set()
@@ -260,7 +266,7 @@ class Fit(ABC):
             order=self.order,
             steps=tuple(self.steps),
             entries=self.entries(design),
-            notes=(*self.missing, *self.exceeded(design)),
+            notes=(*self.missing, *self.left_out(design), *self.exceeded(design)),
             evaluations=self.evaluations,
         )
 

@@ -225,6 +225,16 @@ class StockFit(Fit):
         state: SumOfSquares = problem.state(x, True)
         return Design(problem, lower, upper, state, {**design.chosen, item: candidate})
 
+    def left_out(self, design: Design) -> list[tuple[str, str]]:
+        model, notes = self.design.problem.model, []
+        stored = () if model.lens.optimization_data is None else model.lens.optimization_data.kept
+        for item in sorted(design.chosen, key=lambda item: item.surfaces):
+            lost: list[str] = []
+            left_of((), (*model.solves, *stored), item.surfaces[0], item.surfaces[-1], lost)
+            if lost:
+                notes.append((item.words, f"left out with the element: {', '.join(lost)}"))
+        return notes
+
     def exceeded(self, design: Design) -> list[tuple[str, str]]:
         lens, notes = design.problem.model.lens_at(design.state.x), []
         for item, candidate in design.chosen.items():

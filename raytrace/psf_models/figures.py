@@ -56,14 +56,14 @@ class CloseUp:
 
 
 @torch.no_grad()
-def close_up_of(psfs: Psf) -> CloseUp:
-    """The light of the kernels of a `Psf`, finely sampled.
+def close_up_of(psfs: Psf, size: float | None = None) -> CloseUp:
+    """The light of the kernels of a `Psf`, finely sampled; size: mm, half the width of all windows instead.
 
     Windows are centred on the centroid of the rays and hold three of their σ, with diffraction three Airy radii more,
     but no less than a pixel where the light is a point. All have one size, unless kernels differ by more than four
     times in width. Where waves would need too many samples, windows are smaller, down to the window of `psfs`.
     """
-    half, centre = _windows(psfs)
+    half, centre = windows(psfs, size)
     places = psfs.fields.reshape(2, -1, half.shape[1]).expand(2, *half.shape)
     plain = MODELS[psfs.model].plain is not None
     numbers: dict[str, Any] = {"rays": _RAYS, "order": None} if plain else {"order": psfs.order}
@@ -96,13 +96,18 @@ def close_up_of(psfs: Psf) -> CloseUp:
         return CloseUp(torch.cat([torch.cat(row, 1) for row in rows]), half, centre)
 
 
-def _windows(psfs: Psf) -> tuple[Tensor, Tensor]:
-    """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill, or that waves can afford."""
+def windows(psfs: Psf, size: float | None = None) -> tuple[Tensor, Tensor]:
+    """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill, or that waves can afford.
+
+    size: mm, half the width of all windows instead.
+    """
     centroid, covariance = (moment.nan_to_num(0.0) for moment in (psfs.ray_centroid, psfs.ray_covariance))
     blur = 2 * safe_sqrt(torch.maximum(covariance[0], covariance[2]))
     if not psfs.wavelengths_summed:
         blur = blur.amax(-1)
         centroid, covariance = mixture(psfs.wavelength_weights.expand(psfs.energy.shape), centroid, covariance)
+    if size is not None:
+        return torch.full_like(blur, size), centroid
     half = _SIGMAS * safe_sqrt(torch.maximum(covariance[0], covariance[2]))
     if psfs.waves:
         number = axial_f_number(with_object_distance(psfs.lens, psfs.object_distances[:, None])).abs()
@@ -137,7 +142,7 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     """
     if close_up is None and not psfs.framed and psfs.order is not None:
         close_up = close_up_of(psfs)
-    distances = psfs.object_distances.tolist()
+    headings = [distance_text(distance) for distance in psfs.object_distances.tolist()]
     labels = row_labels(psfs)
     line = _LINE if psfs.wavelengths_summed or len(psfs.wavelengths) > 2 * _LINE else len(psfs.wavelengths)
     title = ": ".join(filter(None, (psfs.lens.name, f"{psfs.model} PSF")))
@@ -149,11 +154,11 @@ def psf_grid(psfs: Psf, *, close_up: CloseUp | None = None, log: bool = False) -
     pitch = float(psfs.grid.pitch)
     half = 0.5 * pitch * psfs.grid.columns
     if close_up is None:
-        figure, _ = panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log, line)
+        figure, _ = panels(kernels, [[half] * len(headings)] * len(labels), headings, labels, notes, log, line)
         return worded(figure, title, [f"{window(psfs.grid)}; max: light of the brightest pixel", brightness(log)])
     light, each = rows_of(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
-    figure, axes = panels(light, halves, distances, labels, notes, log, line)
+    figure, axes = panels(light, halves, headings, labels, notes, log, line)
     centre = array(psfs.grid.centre).reshape(2, *(psfs.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
@@ -184,20 +189,22 @@ def rows_of(values: np.ndarray, kept: int) -> np.ndarray:
 def panels(
     kernels: Sequence[np.ndarray] | np.ndarray,
     halves: Sequence[Sequence[float]] | np.ndarray,
-    distances: Sequence[float],
+    headings: Sequence[str],
     labels: Sequence[str],
     notes: Sequence[Sequence[str]],
     log: bool,
     line: int = _LINE,
+    peaks: Sequence[float] | None = None,
 ) -> tuple[Figure, np.ndarray]:
     """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
 
-    Distances are above and labels on the left; kernels of one distance follow each other in lines of `line`, each
-    under its label.
+    Headings of the columns, the distances, are above and labels on the left; kernels of one column follow each other in
+    lines of `line`, each under its label. peaks: the end of the brightness of each row, by default of each panel its
+    peak.
     """
     from matplotlib.colors import LogNorm, Normalize
 
-    rows, columns = len(labels), len(distances)
+    rows, columns = len(labels), len(headings)
     flows = columns == 1 and rows > 1
     shape = (-(-rows // line), min(rows, line)) if flows else (rows, columns)
     figure = new_figure(max(4.4, 1.75 * shape[1] + 0.7), (1.85 if max(shape) > 1 else 2.6) * shape[0] + 0.9)
@@ -208,7 +215,7 @@ def panels(
         panel, kernel, half = axes[row, column], kernels[row][column], float(halves[row][column])
         tall = half * kernel.shape[0] / kernel.shape[1]
         extent = (-half, half, -tall, tall)
-        peak = float(kernel.max()) or 1.0
+        peak = (float(kernel.max()) if peaks is None else peaks[row]) or 1.0
         norm = LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
         panel.imshow(kernel, origin="lower", cmap="magma", norm=norm, extent=extent, interpolation="nearest")
         framed(panel)
@@ -219,9 +226,9 @@ def panels(
         if flows:
             panel.set_title(labels[row].replace("\n", ", "), color=INK)
         elif row == 0:
-            panel.set_title(distance_text(distances[column]), color=INK)
+            panel.set_title(headings[column], color=INK)
         if column == 0:
-            panel.set_ylabel((distance_text(distances[0]) if row % line == 0 else "") if flows else labels[row])
+            panel.set_ylabel((headings[0] if row % line == 0 else "") if flows else labels[row])
     for panel in grid.flat[rows:] if flows else ():
         panel.axis("off")
     return figure, axes

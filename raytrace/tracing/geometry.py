@@ -35,13 +35,28 @@ from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import lens_steps, without_apertures
 from raytrace.words import RaytraceWarning, calling_level
 
-#: Points of the pupil whose rays are highest on a surface.
-ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
+#: Points of the rim of the pupil at equal angles from +y, the ends of both diameters among them.
+RIM_POINTS = tuple((round(math.sin(math.pi * k / 6), 15), round(math.cos(math.pi * k / 6), 15)) for k in range(12))
 
 _SIZE = "semi_diameter"
 _SAME = 1e-6  # of a stored automatic semi-diameter: a smaller difference leaves its digits
 _HEIGHTS = 65  # at which two surfaces are compared
 _LEAST = 1e-6  # mm: an overlap that counts
+
+
+def _between(around: int) -> np.ndarray:
+    """Weights (A, 12) of a function at the points RIM_POINTS, for its trigonometric interpolation at A equal angles."""
+    count = len(RIM_POINTS)
+    waves = np.arange(count // 2 + 1)
+    weights = np.where((waves == 0) | (waves == count // 2), 1.0, 2.0) / count
+    angles, points = (2 * np.pi * np.arange(n) / n for n in (around, count))
+    return np.cos((angles[:, None] - points)[..., None] * waves) @ weights
+
+
+#: Between the points the square of a height is interpolated; the largest one is right to 6e-5 in the shipped lenses.
+BETWEEN = _between(180)
+#: The interpolation counts where it exceeds all points by more than this share.
+FARTHER = 1e-7
 
 
 class Unbuildable(RaytraceWarning):
@@ -267,7 +282,7 @@ def clear_semi_diameters(lens: Lens, numbers: Sequence[int]) -> dict[int, Tensor
     """mm () of some surfaces from 1, in the current configuration, with derivatives; of a batch of lenses (L,).
 
     As stored where it is fixed or where no ray arrives, else a h + c: h is the largest height of the rays through the
-    ends of the two diameters of the pupil, of all fields and wavelengths, and a and c are the margin. nan: unknown.
+    rim of the pupil, of all fields and wavelengths, and a and c are the margin. nan: unknown.
     """
     sizes = {k: lens.wavelengths.new_tensor(size) for k, size in fixed_semi_diameters(lens).items()}
     automatic = [k for k in numbers if k not in sizes]
@@ -301,16 +316,21 @@ def light_diameter(lens: Lens, numbers: Sequence[int]) -> float:
 
 
 def _reaches(lens: Lens, last: int) -> list[Tensor]:
-    """Largest √(x² + y²) mm () of the outermost rays on the surfaces 1 to `last`; nan where none arrives.
+    """Largest √(x² + y²) mm () of the rays of the rim on the surfaces 1 to `last`; nan where none arrives.
 
-    No aperture clips these rays: neither in OpticStudio, whose automatic semi-diameters they give.
+    No aperture clips these rays. Where all twelve of a field and a wavelength arrive, the square of their height is
+    interpolated between them. OpticStudio takes those at the ends of both diameters alone.
     """
     lens = without_apertures(lens)
-    points = lens.wavelengths.new_tensor(ENDS, dtype=torch.float64).T
+    points = lens.wavelengths.new_tensor(RIM_POINTS, dtype=torch.float64).T
+    between = points.new_tensor(BETWEEN.T)
     rays, reaches = launch(lens, points, wavelengths=lens.wavelengths), []
     for crossing in islice(lens_steps(lens, rays, lens.wavelengths[:, None]), last):
         position, valid = crossing.rays.position, crossing.rays.valid
-        farthest = torch.where(valid, dot_2(position, position), -1.0).amax((-3, -2, -1))
+        squares = torch.where(valid, dot_2(position, position), -1.0)
+        farthest, around = squares.amax(-1), (squares @ between.to(squares.dtype)).amax(-1)
+        counts = valid.all(-1) & (around > (1 + FARTHER) * farthest)
+        farthest = torch.where(counts, around, farthest).amax((-2, -1))
         reaches.append(torch.where(farthest < 0, torch.nan, safe_sqrt(farthest)))
     return reaches
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from raytrace.materials.environment import in_words as environment_in_words
 from raytrace.materials.glass import label
 from raytrace.maths.numerics import detached, summary, value
-from raytrace.maths.result import Column, Result, Table, number, numbers
+from raytrace.maths.result import Column, Result, Table, number, numbers, quantity_remark, quantity_text
 from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, glass_on_image, is_round_about_axis, media
 from raytrace.system.phases import IdealLens, Phase
@@ -28,7 +28,7 @@ from raytrace.tracing.geometry import (
     warn_of_defects,
 )
 from raytrace.tracing.launch import warn_of_filling
-from raytrace.tracing.paraxial import LINES, first_order, quantity_remark, quantity_text
+from raytrace.tracing.paraxial import LINES, first_order
 from raytrace.tracing.trace import aiming_of
 
 #: Descriptions of phases and sag terms with their numbers; others are described by their class alone.

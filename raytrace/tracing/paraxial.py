@@ -5,14 +5,13 @@ A ray is (y, ω) with ω = n u, u = dy/dz the slope and n the *signed* index, ne
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import Number, quotient, select, value, value_of
-from raytrace.maths.result import Column, Result, Table, flat
+from raytrace.maths.result import Column, Result, Table, flat, quantity_remark, quantity_text
 from raytrace.system.lens import (
     Lens,
     aligned,
@@ -145,7 +144,7 @@ class FirstOrder(Result):
         for name, end in ends.items():
             texts = (quantity_text(end(figures[entry]), infinite.get(entry)) for _, entry, _ in lines)
             printed[Column(name, form=">")] = [*texts]
-        computed = {entry: figures[entry][0] if count == 1 else math.inf for _, entry, _ in lines}
+        computed = {entry: figures[entry][0] if count == 1 else float("inf") for _, entry, _ in lines}
         units = [unit + quantity_remark(computed[entry], infinite.get(entry)) for _, entry, unit in lines]
         printed[Column("unit", form="<", heading=" ")] = units
         return [Table(printed, [f"first-order data of {count} lenses or wavelengths"] if count > 1 else ())]
@@ -153,18 +152,6 @@ class FirstOrder(Result):
 
 #: Pupils so many lengths of the lens away are at infinity, and focal lengths so many are those of an afocal lens.
 _FAR, _AFOCAL = 1e3, 1e4
-
-
-def quantity_text(figure: float, word: str | None = None) -> str:
-    """A number of first-order data as it is printed; word: of one that is infinite in practice."""
-    if word:
-        return word
-    return "-" if math.isnan(figure) else "infinite" if math.isinf(figure) else f"{figure + 0.0:.9g}"
-
-
-def quantity_remark(figure: float, word: str | None = None) -> str:
-    """The number of a quantity that is infinite in practice, behind its unit."""
-    return f"; {figure:.4g} mm by first-order data" if word and math.isfinite(figure) else ""
 
 
 def brackets(powers: Sequence[Number], gaps: Sequence[Number]) -> Matrix:

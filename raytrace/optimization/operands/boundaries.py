@@ -33,7 +33,15 @@ from raytrace.optimization.operands.operand import (
 from raytrace.system.lens import Lens, media
 from raytrace.system.shapes import EVEN, conic_sag
 from raytrace.system.surface import Surface, medium_surfaces, sag_at
-from raytrace.tracing.geometry import ENDS, edge_thickness, fixed_semi_diameters, rims, semi_diameter_margin
+from raytrace.tracing.geometry import (
+    BETWEEN,
+    FARTHER,
+    RIM_POINTS,
+    edge_thickness,
+    fixed_semi_diameters,
+    rims,
+    semi_diameter_margin,
+)
 
 
 class SemiDiameters:
@@ -41,8 +49,9 @@ class SemiDiameters:
 
         s = (1 + a/100) max √(x² + y²) + c
 
-    over all fields and wavelengths and the ends of the two diameters of the pupil; a per cent and c mm are the margin
-    of `OptimizationData`, which neither the stop nor the image has. The derivative is that of the largest ray.
+    over all fields and wavelengths and the rim of the pupil, interpolated between twelve rays as of
+    `tracing.geometry.clear_semi_diameters`; a per cent and c mm are the margin of `OptimizationData`, which neither the
+    stop nor the image has.
     """
 
     def __init__(self, planner: Planner):
@@ -52,6 +61,7 @@ class SemiDiameters:
         self.factors, self.lengths = np.array([semi_diameter_margin(planner.lens, k) for k in range(len(surfaces))]).T
         self.asked: set[int] = set()
         self._bundle: Bundle | None = None
+        self._rims = np.zeros((0, len(RIM_POINTS)), dtype=int)  # numbers of the rays of each rim
 
     def ask(self, surfaces: Iterable[int]) -> None:
         """Register, while rows are planned, surfaces whose semi-diameters they need."""
@@ -74,28 +84,35 @@ class SemiDiameters:
     def _largest_heights(self, state: LensState, surfaces: list[int]) -> tuple[np.ndarray, np.ndarray | None]:
         """Largest √(x² + y²) mm (P,) on some surfaces, and its derivatives (V, P); nan where no ray arrives."""
         marks, places = self._rays(surfaces[-1]).marks(state), np.array(surfaces) - 1
-        x, y, valid = marks.x[places], marks.y[places], marks.valid[places]
-        heights = np.where(valid, np.hypot(x, y), -1.0)
-        ray, rows = heights.argmax(-1), np.arange(len(places))
-        largest = heights[rows, ray]
-        largest = np.where(largest < 0, np.nan, largest)
+        x, y, valid = (part[places][:, self._rims] for part in (marks.x, marks.y, marks.valid))  # (P, R, 12)
+        squares = np.where(valid, x * x + y * y, -1.0)
+        farthest, around = squares.max(-1), (squares @ BETWEEN.T)
+        counts = valid.all(-1) & (around.max(-1) > (1 + FARTHER) * farthest)
+        largest = np.where(counts, around.max(-1), farthest)
+        rows, rim = np.arange(len(places)), largest.argmax(-1)
+        largest = largest[rows, rim]
+        height = np.sqrt(np.where(largest < 0, np.nan, largest))
         if marks.by_x is None or marks.by_y is None:
-            return largest, None
-        cosine, sine = (part[rows, ray] / np.where(largest > 0, largest, 1.0) for part in (x, y))
-        by_x, by_y = (part[places, :, ray] for part in (marks.by_x, marks.by_y))
-        slopes = cosine[:, None] * by_x + sine[:, None] * by_y
-        return largest, np.where(np.isnan(largest)[:, None], 0.0, slopes).T
+            return height, None
+        ray = squares[rows, rim].argmax(-1)
+        weights = np.where(counts[rows, rim, None], BETWEEN[around[rows, rim].argmax(-1)], np.eye(len(RIM_POINTS))[ray])
+        scale = weights / np.where(height > 0, height, 1.0)[:, None]
+        numbers = self._rims[rim]  # (P, 12)
+        by_x, by_y = (part[places[:, None], :, numbers] for part in (marks.by_x, marks.by_y))  # (P, 12, V)
+        x, y = (part[rows, rim] * scale for part in (x, y))
+        slopes = np.einsum("pk,pkv->vp", x, by_x) + np.einsum("pk,pkv->vp", y, by_y)
+        return height, np.where(np.isnan(height), 0.0, slopes)
 
     def _rays(self, last: int) -> Bundle:
-        """The rays through the `ENDS` of all fields and wavelengths up to a surface, the same in every call."""
+        """The rays of the rim of all fields and wavelengths up to a surface, the same in every call."""
         if self._bundle is None:
             fields, self._bundle = self.view.lens.fields, Bundle(self.view, last)
-            largest = float(fields.extent) or 1.0
+            largest, numbers = float(fields.extent) or 1.0, list[list[int]]()
             points = [*zip((fields.x / largest).tolist(), (fields.y / largest).tolist(), strict=True)]
             for wavelength in range(len(self.view.wavelengths)):
                 for field in points:
-                    for end in ENDS:
-                        self._bundle.ask(wavelength, field, end)
+                    numbers.append([self._bundle.ask(wavelength, field, point) for point in RIM_POINTS])
+            self._rims = np.array(numbers)
         return self._bundle
 
 
