@@ -47,9 +47,11 @@ class ToleranceTable(Result):
 
     COLUMNS = (
         Column("row", form="d"),
+        Column("tolerance", form="<"),
         Column("minimum", form=".6g"),
         Column("maximum", form=".6g"),
         Column("sigmas", form=".3g"),
+        Column("source", form="<"),
     )
 
     def __len__(self) -> int:

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import io
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -170,7 +171,7 @@ def _pieces(section: Section, number: int) -> Iterator[_Piece | _Table]:
     if section.gap:
         yield _paragraph(section.gap, italic=True)
     waiting: list[Picture] = []
-    for block in section.blocks:
+    for block, following in itertools.zip_longest(section.blocks, section.blocks[1:]):
         if isinstance(block, Picture):
             waiting.append(block)
             continue
@@ -183,7 +184,7 @@ def _pieces(section: Section, number: int) -> Iterator[_Piece | _Table]:
         elif isinstance(block, Grid):
             yield from _grid(block)
         else:
-            yield _paragraph(block)
+            yield dataclasses.replace(_paragraph(block), keep=isinstance(following, Grid))
     yield from _pictures(waiting)
 
 
