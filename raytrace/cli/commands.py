@@ -524,7 +524,8 @@ on request: {", ".join(ON_REQUEST)}""",
         ),
         group(
             "stopping",
-            Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
+            Option("cycles", count, "N", "maximum, including those before --resume (default 500); of a choice of "
+                "glasses, spacers, parts or test plates that of each of its descents"),
             "seconds",
             Option("paths", count, "N", "damping strategies to try", default=1),
         ),
