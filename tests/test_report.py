@@ -350,7 +350,7 @@ def test_the_style_of_the_user_does_not_change(report):
     assert dict(matplotlib.rcParams) == before
 
 
-@pytest.mark.parametrize("lines", range(40, 56))
+@pytest.mark.parametrize("lines", range(28, 40))
 def test_paragraphs_stay_with_the_table_behind_them(lines):
     grid = rows_grid(("a",), [(str(k),) for k in range(5)], "l")
     sections = Section("a", "A", ("text",) * lines), Section("b", "B", ("first", "second", grid))

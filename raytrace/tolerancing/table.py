@@ -15,7 +15,6 @@ from raytrace.maths.result import Column, Result, Table, number
 from raytrace.system.tolerance_data import DISTRIBUTIONS, TEST_WAVELENGTH, Compensator, Tolerance
 from raytrace.words import RaytraceError
 
-
 _LETTERS = 9  # sources that are named by letters
 
 
