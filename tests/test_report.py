@@ -360,3 +360,10 @@ def test_paragraphs_stay_with_the_table_behind_them(lines):
     ]
     (page,) = (texts for texts in pages if "first" in texts)
     assert {"2   B", "first", "second", "0", "4"} <= {*page}
+
+
+def test_a_reason_of_all_configurations_is_stated_once():
+    report = rt.report("scan_lens", only=["distortion"])
+    (section,) = report.content.sections
+    assert section.gap.count("all fields are on the axis") == 1
+    assert section.gap.startswith("Distortion: nothing to show")
