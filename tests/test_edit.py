@@ -582,6 +582,29 @@ def test_a_mount_alone_states_the_expansion_of_all_spaces(tmp_path):
     assert [k for k, each in enumerate(stated) if each is not None] == [2, 4, 6, 7, 9]
 
 
+def test_the_command_stores_the_system_and_conditions(tmp_path):
+    out = tmp_path / "out.zmx"
+    words = (
+        "f_number=5 fields=0,7,10 field_weights=2,1,1 wavelengths=0.48,0.55,0.64 primary_wavelength=2 ray_aiming=real"
+    )
+    words = ["--system", *words.split(), "object_distance=2000", "--conditions", "efl=100", "edge>=1"]
+    assert main(["edit", "cooke_triplet", *words, "-o", str(out)]) == 0
+    lens = rt.read_lens("cooke_triplet").at(
+        f_number=5, fields=[0, 7, 10], field_weights=[2, 1, 1], wavelengths=[0.48, 0.55, 0.64], primary_wavelength=2,
+        ray_aiming="real", object_distance=2000,
+    )  # fmt: skip
+    new = rt.read_lens(out)
+    assert [*map(str, new.conditions)] == [*map(str, lens.with_conditions("efl=100 edge>=1").conditions)]
+    assert (new.ray_aiming, new.primary_wavelength) == ("real", 2)
+    assert torch.equal(rt.spot(new).rms_radius, rt.spot(lens).rms_radius)
+    assert (
+        main(["edit", str(out), "--system", "fields=0:0,3:-4", "--conditions", "none", "-o", str(tmp_path / "x.zmx")])
+        == 0
+    )
+    bare = rt.read_lens(tmp_path / "x.zmx")
+    assert (bare.conditions, bare.fields.x.tolist(), bare.fields.y.tolist()) == ((), [0.0, 3.0], [0.0, -4.0])
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -595,6 +618,9 @@ def test_a_mount_alone_states_the_expansion_of_all_spaces(tmp_path):
         (["--bend", "1-2", "flat"], "'flat': expected a shape factor"),
         (["--split", "1-2", "air=2"], "no setting 'air'"),
         (["--delete"], "no surfaces; give numbers"),
+        (["--system", "fnumber=4"], "no 'fnumber'; did you mean f_number?"),
+        (["--system", "fields=0,b"], "'0,b' is no number or list of them"),
+        (["--conditions", "elf=100"], "'elf' is nothing to hold"),
     ],
 )
 def test_the_command_refuses_in_words(words, message, tmp_path, capsys):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.analysis.setting import NothingToShow
 from raytrace.maths.sampling import gauss_rings
 from raytrace.tracing.spot import image_rays
 
@@ -25,3 +26,9 @@ def test_the_geometric_mtf_of_steep_aberrations_is_a_sum_over_many_rays(name):
             [(torch.exp(2j * math.pi * f * (y - y.mean())) * weights).sum().abs() for f in frequencies]
         )
         torch.testing.assert_close(curves.tangential[field], wanted, rtol=0, atol=2e-5)
+
+
+def test_a_lens_without_a_focus_has_no_frequencies():
+    with pytest.raises(NothingToShow, match="the lens has no focus"):
+        rt.mtf("phone_plates")
+    assert float(rt.mtf("phone_plates", [10.0], geometric=True).tangential.max()) < 0.1

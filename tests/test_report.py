@@ -348,3 +348,22 @@ def test_the_style_of_the_user_does_not_change(report):
     before = dict(matplotlib.rcParams)
     pdf(report.content)
     assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize("lines", range(28, 40))
+def test_paragraphs_stay_with_the_table_behind_them(lines):
+    grid = rows_grid(("a",), [(str(k),) for k in range(5)], "l")
+    sections = Section("a", "A", ("text",) * lines), Section("b", "B", ("first", "second", grid))
+    pages = [
+        [text for _, piece in placed for _, _, text, _ in piece.texts]
+        for placed in _paginated(Document("Title", (), sections))[0]
+    ]
+    (page,) = (texts for texts in pages if "first" in texts)
+    assert {"2   B", "first", "second", "0", "4"} <= {*page}
+
+
+def test_a_reason_of_all_configurations_is_stated_once():
+    report = rt.report("scan_lens", only=["distortion"])
+    (section,) = report.content.sections
+    assert section.gap.count("all fields are on the axis") == 1
+    assert section.gap.startswith("Distortion: nothing to show")

@@ -221,8 +221,9 @@ def test_fields_and_wavelengths_of_the_header():
     assert (found.primary_wavelength, found.wavelength_weights.tolist()) == (2, [1.0, 2.0, 1.0])
 
 
-def test_units_of_the_header():
-    found = lens(system=SYSTEM + "# units: in\n")
+@pytest.mark.parametrize("unit", ["in", "inches"])
+def test_units_of_the_header(unit):
+    found = lens(system=SYSTEM + f"# units: {unit}\n")
     assert float(found.surfaces[1].thickness) == 4 * 25.4
     assert float(found.surfaces[1].curvature) == (1 / 50) / 25.4
     assert float(found.aperture.value) == 254.0

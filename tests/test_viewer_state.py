@@ -278,6 +278,11 @@ def test_numbers_of_a_refresh_are_those_of_the_library(name):
         shown = torch.tensor(found["curvature"][section], dtype=torch.float64)
         assert torch.allclose(shown, curve.T, atol=1e-5 * float(curve.abs().max()))
     slow = compute.mtf_of_field(state, 1)["mtf"]
+    both = compute.mtf_of_field(reduce(state, {"type": "compare", "on": True}), 1)
+    of_stored = compute.mtf_of_field(dataclasses.replace(state, lens=state.stored), 1)["mtf"]
+    assert both["stored_mtf"] == of_stored  # compared with the stored lens by the same kind of MTF
+    assert both["mtf"] == slow
+    assert "stored_mtf" not in compute.mtf_of_field(state, 1)
     exact = rt.mtf(lens, frequencies, fields=fields[:, 1:2])
     assert slow["transfer"] == "diffraction"
     assert torch.allclose(torch.tensor(slow["sagittal"], dtype=torch.float64), exact.sagittal, atol=1e-4)

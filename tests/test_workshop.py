@@ -201,6 +201,19 @@ def test_files_have_a_page_a_sheet_and_come_back_the_same(tmp_path):
     assert drawings.to_frame().thickness.tolist() == [4.0, 2.5]
 
 
+def test_the_assembly_has_the_stop_and_sheets_the_names_of_elements():
+    lens = rt.edit.rename(rt.read_lens("cooke_triplet"), comments={1: "front crown"})
+    assembly, element, *_ = rt.draw(lens, elements=[]).sheets()
+    texts = [text for *_, text, _ in assembly.texts]
+    assert (
+        texts[texts.index(f"stop, surface {lens.stop}") + 1]
+        == f"⌀ {2 * rt.tracing.geometry.semi_diameters(lens)[lens.stop]:.3f}"
+    )
+    assert any(text == "Element 1: front crown" for *_, text, _ in element.texts)
+    at_a_face = rt.draw("cemented_achromat").sheets()[0]
+    assert not any(text.startswith("stop,") for *_, text, _ in at_a_face.texts)
+
+
 def test_the_command_writes_a_sheet(command):
     code, out, err = command(
         "draw", "singlet", "--elements", 1, "--grade", "high", "--date", "2026-11-29", "-o", "1.svg"

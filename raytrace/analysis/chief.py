@@ -79,6 +79,7 @@ class Distortion(OverField):
             over_field(panel, curves, seen(100 * values, curves.valid))
             panel.set_xlabel(f"{name} distortion (%)")
             drawn_at_least([panel], 1e-6, "x")
+            panel.locator_params(axis="x", nbins=4)  # long numbers of a small distortion do not touch
         return finished(panels[-1], curves, "distortion", len(curves.wavelengths))
 
 

@@ -24,6 +24,7 @@ from raytrace.analysis.pupil_autocorrelation import (
 )
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
+    NothingToShow,
     Numbers,
     Points,
     field_words,
@@ -338,13 +339,16 @@ def _tables(curves: Mtf | ThroughFocusMtf) -> list[Table]:
 
 def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:
     """Frequencies (size,) cycles/mm from 0 to 2/σ, σ along a section of the spot of the sharpest field (2, F), and to
-    half the cutoff of diffraction at the most; not differentiated."""
+    half the cutoff of diffraction at the most; not differentiated. Raises NothingToShow where no cone of light ends on
+    the sensor."""
     with torch.no_grad():
         points, weights = gauss_rings(6, **like(lens))
         rays = image_rays(lens, points, fields=fields)
         radius = spot_of(rays, weights).rms_radius
         sharpest = torch.where(rays.valid.any(-1), radius, torch.inf).amin() * 0.5**0.5
         top = torch.minimum(0.5 * cutoff(lens, primary_wavelength(lens)), 2 / sharpest)
+    if not bool(top > 0):
+        raise NothingToShow(f"nothing to show: the lens has no focus; give {option('frequencies')}, or focus the lens")
     return top * torch.linspace(0, 1, size, dtype=top.dtype, device=top.device)
 
 

@@ -176,6 +176,12 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("temperatures", None, "C", "+", "the lens at other temperatures as configurations, °C as -20 60, that of the lens "
      "first: radii, thicknesses and aspheres by thermal pickups, so that `optimize` makes it athermal; --mount is the "
      "material of its spaces, 4=invar that of the space behind surface 4"),
+    ("system", None, "NAME=VALUE", "+", "other conditions: f_number=4 or entrance_pupil_diameter=10, fields=0,7,10 (or "
+     "0:0,3:4 of x:y) in the kind of the lens, wavelengths=0.4861,0.5876,0.6563 primary_wavelength=2, field_weights, "
+     "wavelength_weights, ray_aiming=real, object_distance=1000, magnification=-0.1, sensor_distance, temperature, "
+     "pressure"),
+    ("conditions", None, "NAME=VALUE", "+", "conditions that optimisations meet, stored in the lens, as of --hold of "
+     "optimize: efl=100 'edge>=1'; none removes all"),
     ("rename", None, "TITLE", None, "the title"),
     ("comment", None, "SURFACES TEXT", "+", "the comment of a surface"),
 )  # fmt: skip
@@ -327,6 +333,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
         lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
         lens.zmx --semi-diameters margin=2,0.5 chip_zone=0.5 --semi-diameters 1-2 mechanical=12.7 -o sized.zmx
+        lens.zmx --system f_number=4 fields=0,7,10 ray_aiming=real --conditions efl=100 'edge>=1' -o specified.zmx
         lens.zmx --insert 3 radius=50,thickness=4,glass=N-BK7 radius=-80,thickness=1 --delete 9-10 -o changed.zmx
         lens.zmx --join 4 --comment 1 "front element" -o tidy.zmx
         cooke_triplet --temperatures -20 60 --mount aluminium -o warm.zmx
@@ -517,7 +524,8 @@ on request: {", ".join(ON_REQUEST)}""",
         ),
         group(
             "stopping",
-            Option("cycles", count, "N", "maximum, including those before --resume (default 500)"),
+            Option("cycles", count, "N", "maximum, including those before --resume (default 500); of a choice of "
+                "glasses, spacers, parts or test plates that of each of its descents"),
             "seconds",
             Option("paths", count, "N", "damping strategies to try", default=1),
         ),

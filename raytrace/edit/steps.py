@@ -14,7 +14,7 @@ from raytrace.maths.result import Column, Result, Table, number
 from raytrace.system.expansion import spaces
 from raytrace.system.lens import Lens
 from raytrace.tracing.paraxial import first_order
-from raytrace.words import option
+from raytrace.words import did_you_mean, option
 
 #: An edit by its name, and its words.
 Step = tuple[str, Any]
@@ -167,6 +167,51 @@ def _temperatures(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     return lens.with_temperatures([float(number) for number in celsius])
 
 
+#: What `--system` changes, the words of `Lens.at`: how its text is read.
+_SYSTEM: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(
+        ("object_distance", "magnification", "sensor_distance", "f_number", "entrance_pupil_diameter", "temperature",
+         "pressure"), float,
+    ),
+    **dict.fromkeys(
+        ("wavelengths", "wavelength_weights", "field_weights"), lambda text: [*map(float, text.split(","))]
+    ),
+    "fields": lambda text: [
+        tuple(map(float, point.split(":"))) if ":" in point else float(point) for point in text.split(",")
+    ],
+    "primary_wavelength": int,
+    "ray_aiming": str,
+}  # fmt: skip
+
+
+def _system(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    """The lens under other conditions, `Lens.at`: NAME=VALUE …"""
+    given: dict[str, Any] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        if name not in _SYSTEM:
+            meant = did_you_mean(name, _SYSTEM)
+            raise BadEdit(f"{option('system')} {word}: no {name!r}{meant}; expected some of {', '.join(_SYSTEM)}")
+        try:
+            given[name] = _SYSTEM[name](text)
+        except ValueError as error:
+            raise BadEdit(
+                f"{option('system')} {word}: {text!r} is no number or list of them; expected it as f_number=4, "
+                "fields=0,7,10, or fields=0:0,3:4 of x:y"
+            ) from error
+    if any(isinstance(point, tuple) for point in given.get("fields", ())):
+        given["fields"] = [point if isinstance(point, tuple) else (0.0, point) for point in given["fields"]]
+    try:
+        return lens.at(**given)
+    except ValueError as error:
+        raise BadEdit(f"{option('system')} {' '.join(words)}: {error}") from error
+
+
+def _conditions(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    """The lens with conditions, `Lens.with_conditions`; "none" removes all."""
+    return lens.with_conditions([], only=True) if [*words] == ["none"] else lens.with_conditions(" ".join(words))
+
+
 def _comment(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     surfaces, text = (chosen, words[0]) if len(words) == 1 and chosen else (words[0], " ".join(words[1:]))
     return rename(lens, comments={surfaces: text})
@@ -212,6 +257,8 @@ STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
     "bend": _bend,
     "semi_diameters": _semi_diameters,
     "temperatures": _temperatures,
+    "system": _system,
+    "conditions": _conditions,
     "rename": lambda lens, title, chosen: rename(lens, title),
     "comment": _comment,
 }

@@ -49,6 +49,7 @@ _INFINITE = re.compile(r"[+-]?(inf|infinity|infinite|∞|1\.#inf)", re.ASCII | r
 
 #: Millimetres in a unit of length.
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1e3, "METER": 1e3}
+MILLIMETRES |= {"MILLIMETERS": 1.0, "MILLIMETRES": 1.0, "INCHES": 25.4, "METERS": 1e3, "METRES": 1e3}
 
 
 # -- places and errors ------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table
 from raytrace.optimization.attained import NotReached, attained_by
 from raytrace.optimization.merit import DefaultMerit, Merit
-from raytrace.plotting.style import GREY, INK, new_figure, styled
+from raytrace.plotting.style import GREY, INK, fill, new_figure, styled
 from raytrace.settings import GRADES
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -388,7 +388,9 @@ class ToleranceAnalysis(Result):
     @styled
     def draw(self, **options: Any) -> "Figure":
         """Histogram of the trials with the expectation and the yield curve, and the tolerances that count most."""
-        figure = new_figure(9.0, 4.2)
+        figure = new_figure(9.0, 4.5)
+        title = f"{self.lens.name or 'Lens'}\nas built, {len(self.tolerances) - len(self.tolerances.radial)} tolerances"
+        figure.suptitle(fill(title, figure.get_figwidth(), 10, bold=True), fontweight="bold", fontsize=10)
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
         good = self.trials[~self.trials.isnan()]
         shown = good if len(good) else self.predicted

@@ -15,6 +15,8 @@ from raytrace.maths.result import Column, Result, Table, number
 from raytrace.system.tolerance_data import DISTRIBUTIONS, TEST_WAVELENGTH, Compensator, Tolerance
 from raytrace.words import RaytraceError
 
+_LETTERS = 9  # sources that are named by letters
+
 
 class BadTolerance(RaytraceError, ValueError):
     """A tolerance that the lens does not have, or limits that no error meets."""
@@ -47,9 +49,11 @@ class ToleranceTable(Result):
 
     COLUMNS = (
         Column("row", form="d"),
+        Column("tolerance", form="<"),
         Column("minimum", form=".6g"),
         Column("maximum", form=".6g"),
         Column("sigmas", form=".3g"),
+        Column("source", form="<"),
     )
 
     def __len__(self) -> int:
@@ -160,7 +164,13 @@ class ToleranceTable(Result):
         count = len(self.rows) - len(self.radial)
         title = [f"{count} tolerances, fringes at {self.test_wavelength:g} µm"]
         notes = [f"compensator: {compensator}" for compensator in self.compensators]
-        return [Table(self.columns() if self.rows else {}, title, [*notes, *self.notes])]
+        columns: dict[str, Any] = self.columns() if self.rows else {}
+        sources = dict.fromkeys(row.source for row in self.rows if row.source)
+        if 0 < len(sources) <= _LETTERS:  # long texts, which rows share
+            letters = {"": "", **{source: chr(ord("A") + n) for n, source in enumerate(sources)}}
+            columns["source"] = [letters[self.rows[n].source] for n in columns["source"].tolist()]
+            notes = [*(f"{letters[source]}: {source}" for source in sources), *notes]
+        return [Table(columns, title, [*notes, *self.notes])]
 
     def document(self) -> dict[str, Any]:
         """The rows and compensators as plain values."""

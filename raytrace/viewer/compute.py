@@ -248,15 +248,22 @@ def _lost(lens: Lens, fields: Tensor) -> list[str]:
 
 
 def mtf_of_field(state: State, field: int) -> dict:
-    """The MTF of one of the shown fields, of diffraction; None where the blur is too large for it to differ."""
-    result: dict[str, Any] = {"field": field, "mtf": None}
+    """The MTF of one of the shown fields, of diffraction, and with `compare` that of the stored lens; None where the
+    blur is too large for it to differ."""
+    result: dict[str, Any] = {"field": field, "mtf": _diffraction_mtf(state.lens, field, state.frequency)}
+    if state.compare:
+        result["stored_mtf"] = _diffraction_mtf(state.stored, field, state.frequency)
+    return result
+
+
+def _diffraction_mtf(lens: Lens, field: int, highest: float) -> dict | None:
     with torch.no_grad(), computed_once(), suppress(ValueError, RuntimeError, ArithmeticError):  # as `refresh` reports
-        lens = _simple(state.lens)
+        lens = _simple(lens)
         fields = shown_fields(lens)
         radius = field_spots(lens, fields=fields, rings=1)[0].geometric_radius.nan_to_num(0.0).max()
-        if field < fields.shape[1] and least_reach(float(radius)) >= state.frequency / 3:
-            result["mtf"] = mtf_of(lens, fields[:, field : field + 1], state.frequency, diffraction=True)
-    return result
+        if field < fields.shape[1] and least_reach(float(radius)) >= highest / 3:
+            return mtf_of(lens, fields[:, field : field + 1], highest, diffraction=True)
+    return None
 
 
 def remarks(state: State) -> list[str]:

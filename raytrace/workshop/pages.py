@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import io
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -22,6 +23,7 @@ _WHOLE = 0.35  # of a page: shorter tables are not divided
 _SHRUNK, _FILLING = 0.8, 0.7  # least scales of a figure at the end of a page, and of figures that fill one
 _FOOT = 12.0  # below a table
 _HEAD = 34.0  # the heading of a section
+_LINES = 3  # paragraphs that stay with the table behind them
 _WRAPPED = 90.0  # least width of a column whose texts are set in several lines
 
 
@@ -170,7 +172,7 @@ def _pieces(section: Section, number: int) -> Iterator[_Piece | _Table]:
     if section.gap:
         yield _paragraph(section.gap, italic=True)
     waiting: list[Picture] = []
-    for block in section.blocks:
+    for k, block in enumerate(section.blocks):
         if isinstance(block, Picture):
             waiting.append(block)
             continue
@@ -183,7 +185,8 @@ def _pieces(section: Section, number: int) -> Iterator[_Piece | _Table]:
         elif isinstance(block, Grid):
             yield from _grid(block)
         else:
-            yield _paragraph(block)
+            behind = itertools.dropwhile(lambda other: isinstance(other, str), section.blocks[k : k + _LINES + 1])
+            yield dataclasses.replace(_paragraph(block), keep=isinstance(next(behind, None), Grid))
     yield from _pictures(waiting)
 
 

@@ -8,7 +8,9 @@ import contextlib
 import dataclasses
 import datetime
 import functools
+import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -57,6 +59,9 @@ from raytrace.workshop.indications import tolerances_for
 from raytrace.workshop.pages import pdf
 from raytrace.workshop.sheets import draw
 from raytrace.workshop.web import page
+
+#: Of the name of an analysis, the configuration that it is of.
+_CONFIGURATION = re.compile(r", configuration \d+")
 
 _SAMPLES = 6  # fields of the tables over the field
 _TEMPERATURES = 5
@@ -454,11 +459,18 @@ def _section(name: str, request: _Request, told: set[str]) -> Section:
     notes = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RaytraceWarning))
     fresh = [note for note in notes if note not in told]
     told.update(fresh)
-    gaps = [*dict.fromkeys(writer.gaps)]
+    gaps = _shared(writer.gaps, len(request.lenses))
     if not writer.blocks:
         return Section(name, KINDS_OF_SECTIONS[name].title, (), (), " ".join(gaps) or "Nothing to report.")
     blocks = [*writer.blocks, *gaps, *(f"Note: {note}" for note in fresh)]
     return Section(name, KINDS_OF_SECTIONS[name].title, tuple(blocks), tuple(writer.documents))
+
+
+def _shared(gaps: Sequence[str], count: int) -> list[str]:
+    """The reasons, each once: one that all configurations have is stated without their numbers."""
+    alike = Counter(_CONFIGURATION.sub("", gap) for gap in dict.fromkeys(gaps))
+    merged = (general if alike[general := _CONFIGURATION.sub("", gap)] == count else gap for gap in gaps)
+    return [*dict.fromkeys(merged)]
 
 
 def _about(request: _Request) -> list[str]:

@@ -27,6 +27,7 @@ from raytrace.settings import DRAWINGS
 from raytrace.system.elements import cemented_groups
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN, KINDS
+from raytrace.tracing.geometry import semi_diameters
 from raytrace.tracing.lens_report import remarks
 from raytrace.words import option
 from raytrace.workshop import dxf, step
@@ -290,7 +291,9 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
         _asphere(paper, lens, face, "left" if face is parts[0].faces[0] else "right", 196.0, _TOP - 4 - k * 66)
     for k, line in enumerate(lines):
         paper.fitted(MARGIN + 2, _FOOT + 3 + 3.4 * (len(lines) - 1 - k), line, right - MARGIN - 4, 6)
-    _title_block(paper, drawings, name, scale, (_SPLIT, _FOOT))
+    comment = lens.surfaces[parts[0].surfaces[0]].comment.strip()
+    words = f"{name}: {comment}" if comment and parts[0].surfaces[0] != lens.stop else name
+    _title_block(paper, drawings, words, scale, (_SPLIT, _FOOT))
     return paper
 
 
@@ -508,7 +511,7 @@ def _scaled(point: Sequence, scale: float, origin: tuple[float, float]) -> tuple
 
 
 def _distances(drawings: Drawings) -> list[tuple[str, str]]:
-    """Distances along the light between the parts, the stop and the image, with their tolerances."""
+    """Distances along the light between the parts, the stop and the image, with their tolerances, and the stop."""
     lens, given = drawings.lens, drawings.indications
     stations = {end for part in drawings.parts for end in part.surfaces} | {lens.stop, len(lens.surfaces) - 1}
     inside = {(a, b) for a, b in (part.surfaces for part in drawings.parts) if a != b}
@@ -520,4 +523,6 @@ def _distances(drawings: Drawings) -> list[tuple[str, str]]:
             continue
         length = abs(float(sum(surface.thickness for surface in lens.surfaces[a:b])))
         rows.append((f"surface {words[a]} to {words[b]}", toleranced(length, given.row("thickness", a))))
-    return rows
+    diameter = 2 * semi_diameters(lens)[lens.stop]
+    is_apart = all(lens.stop not in part.surfaces for part in drawings.parts)
+    return rows + ([(f"stop, surface {lens.stop}", f"⌀ {diameter:.3f}")] if is_apart and diameter > 0 else [])

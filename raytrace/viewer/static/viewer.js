@@ -442,14 +442,14 @@ class Viewer {
 
   // Slower analyses, one field after the other, until something else happens.
   settled(reply, event) {
-    if (reply.mtf && this.last.analyses.mtf) {
-      const found = (this.slow = event.field === 0 ? [] : this.slow || []);
-      found[event.field] = reply.mtf;
-      const count = this.last.analyses.fields.length;
-      if (found.filter(Boolean).length === count) {
+    if (event.field === 0 || !this.slow) this.slow = { mtf: [], stored_mtf: [] };
+    for (const [name, shown] of [["stored_mtf", this.last.stored], ["mtf", this.last.analyses]]) if (reply[name] && shown && shown.mtf) {
+      const found = this.slow[name];
+      found[event.field] = reply[name];
+      if (found.filter(Boolean).length === shown.fields.length) {
         const mtf = { ...found[0], tangential: found.map((one) => one.tangential[0]), sagittal: found.map((one) => one.sagittal[0]) };
         if (found.some((one) => one.transfer !== found[0].transfer)) mtf.transfer = "diffraction, in part geometric";
-        this.last.analyses.mtf = mtf;
+        shown.mtf = mtf;
         this.draw();
       }
     }
