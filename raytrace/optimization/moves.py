@@ -1,113 +1,117 @@
-"""Searches from a lens to lenses with an element more (`saddle_points`) or less (`removal`).
+"""Moves of a search: to lenses of other surfaces, along lenses that meet the same paraxial conditions.
 
-The lens itself is followed to its minimum; from there each move leads to a lens of other surfaces, in descents of its
-own. Rows and conditions name the surfaces of the new lens by their new numbers.
+A move begins at a lens at its minimum, and changes no ray at first: surfaces are added, or taken out, where a gap has
+no thickness (`saddle_points`, `removal`). The gap grows, or shrinks before, in parts; each part is projected and
+descends a little. `lens_moves` takes the moves of all lenses of a search.
+
+Paraxial projection: all free curvatures are scaled to the power that the lens had, and the sensor is moved to the same
+distance from the paraxial focus; then the shortest steps meet the equalities of the conditions.
+
+Paraxial projections after discrete changes of a lens: Teh, Vicini, Bickel, Gkioulekas & O'Toole, Automated design of
+compound lenses with discrete-continuous optimization, SIGGRAPH Asia 2025.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from raytrace.edit.numbering import Numbering
 from raytrace.optimization.conditions import Condition
 from raytrace.optimization.operands.boundaries import BOUNDARIES
-from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.search_tasks import (
-    FOLLOW,
-    LONG,
-    Journal,
-    Minima,
-    Minimum,
-    SearchProblem,
-    Stage,
-    TaskResult,
-    descended,
-)
+from raytrace.optimization.search_tasks import SearchProblem, Space, Stage, TaskResult
+from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Row
-from raytrace.words import option
+from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.system.surface import Surface, is_posed
+
+_MEETINGS = 4  # of conditions, by shortest steps
 
 
 @dataclass(frozen=True)
 class Move:
-    """A step to a lens of other surfaces: its search problem, and descents by their keys, functions of a time limit."""
+    """A step to a lens of other surfaces: its name, its search problem, and the descent to variables near its minimum,
+    a function of a time of `time.monotonic`."""
 
-    task: SearchProblem
-    descents: Sequence[tuple[str, Callable[[float], TaskResult]]]
-
-
-@dataclass
-class FromLens:
-    """The search from a lens; moves: of its minimum, as many as `count` descents; name: the option of the search."""
-
-    task: SearchProblem
-    journal: Journal
-    moves: Callable[[Lens], Iterator[Move]]
-    count: int
     name: str
-    families: dict[tuple, tuple[SearchProblem, Minima]] = field(default_factory=dict)
-    started: int = 0  # descents
-
-    DONE: ClassVar[str] = "surfaces"
-
-    @property
-    def followed(self) -> int:
-        """Descents that were followed to their end."""
-        return self.started
-
-    def through(self, progress: Callable | None) -> None:
-        """The lens itself, then every move. Raises SearchStopped and NoProblem."""
-        model, space = self.task.model, self.task.space
-        stage = Stage(self.task.whole, LONG, FOLLOW, space.lower, space.upper)
-        until = self.journal.until
-        of_lens = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
-        if not of_lens.is_valid:
-            raise NoProblem(
-                f"{option(self.name)}: the lens itself loses rays or violates {option('hold')}; search without it first"
-            )
-        lens, work = model.lens_at(of_lens.x), of_lens.seconds
-        bar = None if progress is None else progress(self.count, "descent")
-        try:
-            for move in self.moves(lens):
-                work += self._taken(move, work, bar)
-        finally:
-            if bar is not None:
-                bar.close()
-
-    def _taken(self, move: Move, work: float, bar: Any) -> float:
-        """The descents of a move; the seconds that they took."""
-        until, space = self.journal.until, move.task.space
-        tasks = [(key, lambda descent=descent: descent(until)) for key, descent in move.descents]
-        ends = self.journal.each(tasks, len(space.lower))
-        ranges = np.maximum(space.upper - space.lower, 1e-300)
-        _, minima = self.families.setdefault(_family(move.task), (move.task, Minima(ranges)))
-        for (key, _), end in zip(tasks, ends, strict=True):
-            work += end.seconds
-            minima.add(end, key, work)
-            self.started += 1
-            if bar is not None:
-                bar.update(1)
-                each = self.each()
-                bar.set_postfix_str(f"{len(each)} minima, the best {each[0][1].result.merit:.6g}" if each else "")
-        return sum(end.seconds for end in ends)
-
-    def each(self) -> list[tuple[SearchProblem, Minimum]]:
-        """All minima, the best first, each with its problem."""
-        minima = [(task, minimum) for task, distinct in self.families.values() for minimum in distinct.each]
-        return sorted(minima, key=lambda pair: pair[1].result.merit)
+    task: SearchProblem
+    taken: Callable[[float], TaskResult]
 
 
-def _family(task: SearchProblem) -> tuple:
-    """Media, stop and variables: minima of lenses with the same ones can be compared."""
-    lens = task.model.lens
-    variables = tuple(variable.address for variable in task.model.variables)
-    media = tuple((surface.glass.name, *surface.glass.coefficients.tolist()) for surface in lens.surfaces)
-    return media, lens.stop, variables
+def no_sphere(surface: Surface) -> bool:
+    """Whether a surface is other than a centred refracting sphere."""
+    shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
+    return surface.is_mirror or any(part is not None for part in shaped) or is_posed(surface)
 
 
-# -- rows of a lens of other surfaces ----------------------------------------------------------------------------------
+# -- the paraxial projection -------------------------------------------------------------------------------------------
+
+
+def projected(space: Space, before: np.ndarray) -> Callable[[Stage, np.ndarray], np.ndarray]:
+    """The paraxial projection on the power and the defocus of the lens at `before` (n,), for `descended`."""
+    wanted = space.paraxial(before)
+
+    def project(stage: Stage, x: np.ndarray) -> np.ndarray:
+        return met(stage, space.restored(x, wanted, stage.lower, stage.upper))
+
+    return project
+
+
+def met(stage: Stage, x: np.ndarray) -> np.ndarray:
+    """x with the equalities of the conditions met, by the shortest steps."""
+    x = np.clip(x, stage.lower, stage.upper)
+    moves = stage.moves(x)
+    for _ in range(_MEETINGS):
+        state = stage.problem.state(x, True)
+        if not len(state.held) or not state.is_finite:
+            return x
+        columns = np.sqrt((state.jacobian**2).sum(0))
+        scale = np.where(columns > 0, columns, 1.0)
+        back = np.linalg.lstsq((state.held_slope / scale)[:, moves], state.held, rcond=None)[0]
+        x = x.copy()
+        x[moves] -= back / scale[moves]
+        x = np.clip(x, stage.lower, stage.upper)
+    return x
+
+
+# -- the search problem of other lenses --------------------------------------------------------------------
+
+
+def started_at(task: SearchProblem, x: np.ndarray) -> SearchProblem:
+    """The search problem from the lens at variables (n,)."""
+    model = task.model
+    return replace(task, model=DesignVariables(model.lens_at(x), model.variables, model.solves))
+
+
+def changed(
+    task: SearchProblem,
+    lens: Lens,
+    numbering: Numbering,
+    new: dict[Vary, tuple[float, float]],
+    rows: Sequence[Row] | None = None,
+) -> SearchProblem:
+    """The search problem of a lens of other surfaces, whose variables, rows and conditions have their new numbers.
+
+    new: further variables and their bounds; rows: instead of those of the task by their new numbers.
+    """
+    old = ((numbering.variable(variable), *ends) for variable, *ends in zip(task.model.variables, *task.bounds,
+                                                                           strict=True))  # fmt: skip
+    bounds = {variable: (least, most) for variable, least, most in old if variable is not None} | new
+    quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *bounds)))
+    variables = tuple(bounds)
+    if new:
+        variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
+    solves: tuple[Solve, ...] = numbering.solves(task.model.solves)
+    if (data := lens.optimization_data) is not None:
+        lens = replace(lens, optimization_data=replace(data, variables=variables, solves=solves))
+    lower, upper = (np.array([bounds[variable][end] for variable in variables], dtype=float) for end in (0, 1))
+    return replace(
+        task,
+        model=DesignVariables(lens, variables, solves),
+        rows=numbering.rows(task.rows) if rows is None else tuple(rows),
+        conditions=conditions_renumbered(task.conditions, numbering),
+        bounds=(lower, upper),
+    )
 
 
 def conditions_renumbered(conditions: Sequence[Condition], numbering: Numbering) -> tuple[Condition, ...]:
@@ -118,6 +122,23 @@ def conditions_renumbered(conditions: Sequence[Condition], numbering: Numbering)
         for condition, rows in moved
         if len(rows) == len(condition.before) + 1
     )
+
+
+def with_gaps(rows: Sequence[Row], numbering: Numbering, k: int, count: int) -> tuple[Row, ...]:
+    """The rows by their new numbers after so many surfaces before surface k: a range of boundaries that reaches to a
+    gap next to surface k contains the new gaps."""
+    widened = []
+    for row, moved in zip(rows, numbering.rows(rows), strict=True):
+        first, last = row.integers
+        if is_boundary(row) and first < last and first <= k and last >= k - 1:
+            moved = replace(moved, integers=(min(moved.integers[0], k), max(moved.integers[1], k + count - 1)))
+        widened.append(moved)
+    return tuple(widened)
+
+
+def is_boundary(row: Row) -> bool:
+    """Whether a row limits the thickness of gaps from one to another."""
+    return row.operand in BOUNDARIES and row.operand[:2] in ("MN", "MX") and row.operand[-1] in "TGA"
 
 
 def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Row, ...]:
@@ -132,8 +153,7 @@ def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Ro
 def _split(row: Row, least: int, most: int, part: float) -> list[Row]:
     """A row of least thicknesses as several: of the other gaps, and with part of its target of those to be thin."""
     first, last = row.integers
-    is_least = row.operand in BOUNDARIES and row.operand[:2] == "MN" and row.operand[-1] in "TGA"
-    if not is_least or last < least or first > most:
+    if not (is_boundary(row) and row.operand.startswith("MN")) or last < least or first > most:
         return [row]
     ranges = [(first, least - 1), (max(first, most + 1), last)]
     rows = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]
