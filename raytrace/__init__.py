@@ -50,6 +50,7 @@ PUBLIC = {
     "delete": "edit.surfaces",
     "join": "edit.surfaces",
     "split": "edit.surfaces",
+    "cement": "edit.surfaces",
     "bend": "edit.surfaces",
     "rename": "edit.surfaces",
     "semi_diameters": "edit.sizes",

@@ -18,6 +18,7 @@ from raytrace.optimization.operands.boundaries import BOUNDARIES
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.configurations import differences
 from raytrace.system.dimensions import ARGUMENTS, DIMENSION, POWERS, scaled
+from raytrace.system.elements import cemented_groups
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.phases import PHASES, FringePhase, Hologram, PolynomialPhase, added_path
 from raytrace.system.rays import start
@@ -509,6 +510,68 @@ def assert_same_but_for_spelling(new, lens):
         lines = lens.optimization_data.tolerances
         new = dataclasses.replace(new, optimization_data=dataclasses.replace(new.optimization_data, tolerances=lines))
     assert [*differences(new, lens)] == []
+
+
+# -- cement ------------------------------------------------------------------------------------------------------------
+
+
+def air_spaced(gap=0.0, difference=0.0):
+    rows = [dict(radius=60, thickness=6, glass="N-BK7"), dict(radius=-45, thickness=gap)]
+    rows += [dict(radius=1 / (-1 / 45 + difference), thickness=2.5, glass="N-SF5"), dict(radius=-130, thickness=95)]
+    return rt.lens(rows, stop=3, entrance_pupil_diameter=20, fields=[0, 1.5], catalogs=["schott"])
+
+
+def test_surfaces_that_touch_are_cemented_without_a_change_of_any_ray():
+    lens = air_spaced()
+    new = rt.edit.cement(lens, "2-3")
+    assert [surface.glass.name for surface in new.surfaces] == ["", "N-BK7", "N-SF5", "", ""]
+    assert (new.stop, len(new.surfaces)) == (2, len(lens.surfaces) - 1)
+    assert_close(rt.spot(new).rms_radius, rt.spot(lens).rms_radius, rtol=1e-10, atol=1e-14)
+    assert cemented_groups(new) == [(1, 3)]
+
+
+def test_the_shared_surface_has_the_mean_curvature_and_what_follows_moves_forward():
+    lens = air_spaced(gap=0.7, difference=0.002)
+    new = rt.edit.cement(lens, (2, 3))
+    assert float(new.surfaces[2].curvature) == pytest.approx(-1 / 45 + 0.001, rel=1e-12)
+    track = [sum(float(surface.thickness) for surface in each.surfaces[1:-1]) for each in (lens, new)]
+    assert track[0] - track[1] == pytest.approx(0.7, rel=1e-12)
+    bent = torch.tensor(-0.03, dtype=torch.float64, requires_grad=True)
+    rt.first_order(rt.edit.cement(lens, "2-3", curvature=bent)).effective_focal_length.sum().backward()
+    assert bent.grad is not None
+    assert float(bent.grad) != 0
+
+
+def test_what_refers_to_the_second_surface_is_left_out_and_named():
+    data = OptimizationData(
+        variables=tuple(Vary(k, quantity) for k, quantity in ((2, "curvature"), (3, "curvature"), (2, "thickness"),
+                                                             (3, "thickness"), (4, "curvature")))
+    )  # fmt: skip
+    lens = dataclasses.replace(air_spaced(gap=0.5), optimization_data=data)
+    with pytest.warns(rt.LeftOut, match=r"cement 2-3: left out with the air space: .*curvature"):
+        new = rt.edit.cement(lens, "2-3")
+    left = [(variable.surface, variable.quantity) for variable in new.optimization_data.variables]
+    assert left == [(2, "curvature"), (2, "thickness"), (3, "curvature")]
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "message"),
+    [
+        ("2", "expected the two surfaces of an air space"),
+        ("1-2", "no air space between two glasses"),
+        ("4-5", "no air space|none of this lens"),
+    ],
+)
+def test_other_surfaces_are_not_cemented(surfaces, message):
+    with pytest.raises(rt.BadEdit, match=message):
+        rt.edit.cement(air_spaced(gap=0.5), surfaces)
+
+
+def test_elements_of_one_glass_are_not_cemented():
+    lens = air_spaced(gap=0.5)
+    lens = lens.replace(3, glass=lens.surfaces[1].glass)
+    with pytest.raises(rt.BadEdit, match="both elements are of N-BK7"):
+        rt.edit.cement(lens, "2-3")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem[-40:])

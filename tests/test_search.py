@@ -20,12 +20,12 @@ from raytrace.optimization.conditions import conditions_of
 from raytrace.optimization.curriculum import Growth, Plan, Step
 from raytrace.optimization.least_squares import SolverOptions, least_squares
 from raytrace.optimization.merit import DefaultMerit, Evaluation
-from raytrace.optimization.one_element import thinned
+from raytrace.optimization.moves import projected, started_at, thinned
 from raytrace.optimization.opening import opened
 from raytrace.optimization.operands.operand import conventions_of
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.removal import Removal
-from raytrace.optimization.saddle_points import Place, enlarged, saddle
+from raytrace.optimization.removal import Closing
+from raytrace.optimization.saddle_points import Enlargement, divided, enlarged, saddle
 from raytrace.optimization.search import Minima
 from raytrace.optimization.search_tasks import (
     BadSearch,
@@ -251,7 +251,7 @@ def best_triplet():
 def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k):
     """The merit has no slope along any step that meets the conditions, and curves down along one alone."""
     asked, lens = best_triplet
-    place = Place(k, enlarged(lens, asked, k))
+    place = Enlargement((k, k + 1), (k, k + 1), enlarged(lens, asked, k))
     stage, x = place.stage(0.0, 1, SolverOptions()), place.task.model.start
     size = np.sqrt(stage.problem.state(x, False).cost)
     found = saddle(stage.problem, x, stage.moves(x))
@@ -278,21 +278,22 @@ def test_along_both_lines_of_a_null_meniscus_the_merit_stays(best_triplet):
 @pytest.mark.slow
 def test_from_a_singlet_to_better_lenses_of_two_elements(found, tmp_path):
     how = {**HOW, "hold": "efl=50"}
-    two = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
-    assert (two.stopped, two.starts) == ("surfaces", 2)
+    two = rt.search(found.lens, moves="insert:1", folder=tmp_path, **how)
+    assert (two.stopped, two.starts) == ("moves", 2)
     assert float(two.merit[0]) < 0.8 * float(found.merit[0])
     assert (two.merit[1:] >= two.merit[:-1]).all()
-    assert {task.partition(",")[0] for task in two.tasks} == {"surface 1"}
+    assert {task.partition(",")[0] for task in two.tasks} == {"the lens > insert 1"}
+    assert (two.elements == 2).all()
     assert two.focal_length.tolist() == pytest.approx([50] * len(two.lenses), rel=1e-6)
     for lens in two.lenses:
         glass = [k for k in range(1, 5) if not is_air(lens.surfaces[k].glass)]
         assert glass == [1, 3]
         assert min(float(lens.surfaces[k].thickness) for k in glass) > 2 - 1e-3
         assert min(edge_of(lens, k) for k in glass) > 1 - 1e-3
-    again = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
+    again = rt.search(found.lens, moves="insert:1", folder=tmp_path, **how)
     assert torch.equal(again.variables, two.variables)
-    with pytest.raises(BadSearch, match="a search of other insert"):
-        rt.search(found.lens, insert=[2], folder=tmp_path, **how)
+    with pytest.raises(BadSearch, match="a search of other moves"):
+        rt.search(found.lens, moves="insert:2", folder=tmp_path, **how)
 
 
 def edge_of(lens, k):
@@ -307,7 +308,7 @@ def test_from_a_triplet_to_better_lenses_of_four_elements():
     how = {"merit": merit, "vary": "curvature thickness", "hold": "efl=100"}
     triplet = rt.read_lens("cooke_triplet")
     three = rt.optimize(triplet, cycles=200, **how)
-    four = rt.search(triplet, insert=[1, 4, 7], **how)
+    four = rt.search(triplet, moves="insert:1,4,7", **how)
     assert len(four.lenses) == 6
     assert (four.merit < three.merit_after).all()
     assert float(four.merit[0]) < 0.65 * three.merit_after
@@ -319,14 +320,14 @@ def test_from_a_triplet_to_better_lenses_of_four_elements():
 
 def test_without_power_and_thickness_an_element_changes_no_ray(best_triplet):
     asked, lens = best_triplet
-    removal = Removal(3, lens, asked)
-    stage = removal._stage(0.0)
+    removal = Closing(3, lens, asked)
+    stage = removal.stage(0.0)
     x = np.clip(removal._whole.model.start, stage.lower, stage.upper)
     thin, reduced = removal._whole.model.lens_at(x), removal.reduced
     assert [surface.glass.name for surface in reduced.model.lens.surfaces].count("SK4") == 2
     assert torch.allclose(rt.spot(without(thin, 3, 4)[0]).rms_radius, rt.spot(thin).rms_radius, rtol=1e-9)
     assert len(reduced.model.variables) == len(asked.model.variables) - 4
-    assert reduced.whole.merit(reduced.whole.evaluated(removal._without(x)), removal._without(x)) == pytest.approx(
+    assert reduced.whole.merit(reduced.whole.evaluated(removal.without(x)), removal.without(x)) == pytest.approx(
         stage.problem.merit(stage.problem.evaluated(x), x), rel=1e-9
     )
 
@@ -352,9 +353,9 @@ def test_an_element_that_was_inserted_is_removed_again(best_triplet):
         "bounds": "thickness:1..30 sensor:60..120",
     }
     three = rt.optimize(lens, **how)
-    four = rt.search(lens, insert=[4], **how)
-    again = rt.search(four.lens, delete=True, **how)
-    assert (again.stopped, again.starts) == ("surfaces", 4)
+    four = rt.search(lens, moves="insert:4", **how)
+    again = rt.search(four.lens, moves="delete", **how)
+    assert (again.stopped, again.starts) == ("moves", 4)
     assert float(again.merit[0]) <= 1.001 * three.merit_after
     assert len(again.lens.surfaces) == len(lens.surfaces)
 
@@ -395,12 +396,12 @@ def steep(points):
 def test_lenses_without_an_element_are_followed_to_minima_of_a_loss(tmp_path):
     """Those whose loss is more than twice that of the best one are left out."""
     triplet = rt.read_lens("cooke_triplet").at(wavelengths=[0.5876], fields=[0, 4], f_number=12)
-    how = {"merit": "spot", "vary": "curvature sensor", "hold": "efl", "bounds": "sensor:20..140", "delete": True}
+    how = {"merit": "spot", "vary": "curvature sensor", "hold": "efl", "bounds": "sensor:20..140", "moves": "delete"}
     quantity, denser = rt.optimization.Points(4), rt.optimization.Points(8)
     of_spots = rt.search(triplet, **how)
     of_loss = rt.search(triplet, loss=steep, of=quantity, folder=tmp_path, **how)
     before = [float(steep(quantity(lens))) for lens in of_spots.lenses]
-    assert (of_loss.stopped, len(of_loss.lenses)) == ("surfaces", sum(loss <= 2 * min(before) for loss in before))
+    assert (of_loss.stopped, len(of_loss.lenses)) == ("moves", sum(loss <= 2 * min(before) for loss in before))
     assert 0 < len(of_loss.lenses) < len(of_spots.lenses)
     assert {len(lens.surfaces) for lens in of_loss.lenses} == {len(triplet.surfaces) - 2}
     by_denser = [float(steep(denser(lens))) for lens in of_loss.lenses]
@@ -408,6 +409,168 @@ def test_lenses_without_an_element_are_followed_to_minima_of_a_loss(tmp_path):
     assert of_loss.loss[0] < 0.999 * min(float(steep(denser(lens))) for lens in of_spots.lenses)
     again = rt.search(triplet, loss=steep, of=quantity, folder=tmp_path, **how)
     assert torch.equal(again.variables, of_loss.variables)
+
+
+# -- moves -------------------------------------------------------------------------------------------------------------
+
+
+def problem_of(lens, rows, hold, vary="curvature thickness", bounds="thickness:1..30 sensor:40..120"):
+    free = design_variables(lens, vary)
+    ends = bounds_of(free.lens, free.variables, bounds)
+    return SearchProblem(free, tuple(rows), conditions_of(lens, hold), ends, (2.0, 8.0), (0.5, 30.0), PLAIN)
+
+
+def test_an_element_in_two_parts_of_half_its_power_changes_no_ray(best_triplet):
+    asked, lens = best_triplet
+    cut = divided(lens, asked, 1)
+    made = cut.model.lens
+    c = [0.0 if surface.curvature is None else float(surface.curvature) for surface in made.surfaces]
+    assert c[1] - c[2] == pytest.approx(c[3] - c[4], rel=1e-12)
+    assert c[2] == c[3]
+    assert [surface.glass.name for surface in made.surfaces[1:5]] == ["SK4", "", "SK4", ""]
+    assert float(made.surfaces[2].thickness) == 0
+    before = asked.whole.evaluated(started_at(asked, variables_at(asked, lens)).model.start)
+    assert cut.whole.evaluated(cut.model.start).residuals == pytest.approx(before.residuals, abs=1e-10)
+    assert len(cut.model.variables) == len(asked.model.variables) + 4
+
+
+def variables_at(asked, lens):
+    return dataclasses.replace(asked.model, lens=lens).start
+
+
+@pytest.mark.parametrize(("k", "gaps"), [(1, (1, 2)), (4, (4, 5)), (7, (7, 8))])
+def test_boundaries_hold_for_new_gaps_too_at_either_end_of_the_lens(k, gaps):
+    merit = DefaultMerit(glass_thickness="2:8", air_thickness="0.5:12", edge=1.0, rings=2)
+    lens = rt.read_lens("cooke_triplet")
+    one = enlarged(lens, problem_of(lens, merit.rows(lens), "efl=100"), k)
+    for row in one.rows:
+        if row.operand in ("MNCG", "MNEG", "MNCA", "MNEA", "MXCG", "MXCA"):
+            assert row.integers[0] <= gaps[0], row
+            assert row.integers[1] >= gaps[1], row
+
+
+def test_a_projection_restores_focal_length_defocus_and_conditions(best_triplet):
+    """Of a lens of whose middle element 40 % of the power and the thickness are taken away."""
+    asked, lens = best_triplet
+    closing = Closing(3, lens, asked)
+    whole, stage = closing._whole, closing.stage(0.6)
+    start = whole.model.start
+    flat = np.clip(start, stage.lower, stage.upper)
+
+    def figures(x):
+        made = whole.model.lens_at(x)
+        focus = float(rt.tracing.paraxial_image_distance(made, np.inf))
+        return float(rt.first_order(made).effective_focal_length), float(made.surfaces[-2].thickness) - focus
+
+    assert figures(start)[0] == pytest.approx(100, rel=1e-9)
+    assert abs(figures(flat)[0] - 100) > 20
+    at = projected(whole.space, start)(stage, start)
+    assert figures(at) == pytest.approx(figures(start), rel=1e-6)
+    assert np.abs(stage.problem.state(at, False).held).max() < 1e-9
+    fixed = stage.lower == stage.upper
+    assert fixed.sum() == 3
+    assert np.array_equal(at[fixed], stage.lower[fixed])
+
+
+def doublet():
+    """Two elements whose facing surfaces differ a little, f = 100 mm."""
+    rows = [dict(radius=61, thickness=6, glass="N-BK7"), dict(radius=-45, thickness=0.6)]
+    rows += [dict(radius=-44, thickness=2.5, glass="N-SF5"), dict(radius=-130, thickness=95)]
+    colours = {"wavelengths": [0.4861327, 0.5875618, 0.6562725], "primary_wavelength": 2, "catalogs": ["schott"]}
+    return rt.lens([dict(thickness=1), *rows], stop=1, entrance_pupil_diameter=20, fields=[0, 1.5], **colours)
+
+
+CEMENTED = {
+    "merit": DefaultMerit("spot", rings=2, glass_thickness="2:8", air_thickness="0.2:10", edge=1.0),
+    "vary": "curvature sensor thickness:3",
+    "hold": "efl=100",
+    "bounds": "sensor:60..120 thickness:3:0.2..10",
+}
+
+
+def test_facing_surfaces_that_nearly_agree_are_cemented():
+    found = rt.search(doublet(), moves="cement", **CEMENTED)
+    assert (found.stopped, found.elements.tolist(), found.groups.tolist()) == ("moves", [2], [1])
+    assert [surface.glass.name for surface in found.lens.surfaces] == ["", "", "N-BK7", "N-SF5", "", ""]
+    assert float(found.focal_length[0]) == pytest.approx(100, rel=1e-8)
+    again = rt.optimize(found.lens, **{**CEMENTED, "vary": "curvature sensor", "bounds": "sensor:60..120"})
+    assert again.merit_after == pytest.approx(float(found.merit[0]), rel=1e-3)
+    cemented = rt.edit.cement(doublet(), "3-4")
+    best = rt.optimize(cemented, **{**CEMENTED, "vary": "curvature sensor", "bounds": "sensor:60..120"})
+    assert float(found.merit[0]) <= best.merit_after * 1.01
+
+
+def singlet():
+    rows = [dict(thickness=2), dict(radius=51.68, thickness=4, glass="N-BK7"), dict(thickness=95)]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=20, fields=[0, 3], catalogs=["schott"], name="Singlet")
+
+
+UP_AND_DOWN = {
+    "merit": DefaultMerit("spot", rings=2, glass_thickness="2:8", air_thickness="0.5:10"),
+    "vary": "curvature sensor",
+    "hold": "efl=100",
+    "bounds": "sensor:60..120",
+    "moves": "split delete",
+    "elements": "1:2",
+    "keep": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def one_and_two(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("moves")
+    return folder, rt.search(singlet(), folder=folder, **UP_AND_DOWN)
+
+
+def test_the_best_lens_of_every_number_of_elements_is_found(one_and_two):
+    folder, found = one_and_two
+    assert found.elements.tolist() == [2, 1]
+    assert float(found.merit[0]) < 0.7 * float(found.merit[1])
+    assert found.focal_length.tolist() == pytest.approx([100, 100], rel=1e-8)
+    assert {number: len(lens.surfaces) for number, lens in found.of_elements.items()} == {1: 5, 2: 7}
+    one = rt.optimize(singlet(), **{key: UP_AND_DOWN[key] for key in ("merit", "vary", "hold", "bounds")})
+    assert float(found.merit[1]) <= one.merit_after * 1.001
+    two = found.of_elements[2]
+    glass = [k for k, surface in enumerate(two.surfaces) if surface.glass.name == "N-BK7"]
+    assert min(float(two.surfaces[k].thickness) for k in glass) > 2 - 1e-3
+    keys = [json.loads(line).get("task", "") for line in (folder / "search.jsonl").read_text().splitlines()]
+    assert any("> delete" in key for key in keys)  # down again
+    assert "elements" in str(found)
+
+
+def test_a_search_by_moves_resumes_with_the_same_result(one_and_two, tmp_path):
+    folder, found = one_and_two
+    lines = (folder / "search.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "search.jsonl").write_text("".join(lines[:-3]))
+    again = rt.search(singlet(), folder=tmp_path, **UP_AND_DOWN)
+    assert torch.equal(again.variables.nan_to_num(), found.variables.nan_to_num())
+    assert again.tasks == found.tasks
+    with pytest.raises(BadSearch, match="a search of other elements"):
+        rt.search(singlet(), folder=tmp_path, **UP_AND_DOWN | {"elements": "1:3"})
+
+
+@pytest.mark.slow
+def test_lenses_of_every_number_of_elements_are_at_minima_of_a_loss():
+    """Moves lead from the minima of the merit function, and lenses are kept by the loss."""
+    quantity = rt.optimization.Points(4)
+    found = rt.search(singlet(), loss=mean_distance, of=quantity, **UP_AND_DOWN)
+    assert found.elements.tolist() == [2, 1]
+    denser = rt.optimization.Points(8)
+    assert found.loss.tolist() == pytest.approx([float(mean_distance(denser(lens))) for lens in found.lenses], rel=0.02)
+    assert found.focal_length.tolist() == pytest.approx([100, 100], rel=1e-8)
+    for lens in found.lenses:
+        how = {key: UP_AND_DOWN[key] for key in ("vary", "hold", "bounds")}
+        again = rt.optimize(lens, loss=mean_distance, of=quantity, first=None, **how)
+        assert again.loss.end > 0.98 * again.loss.start
+
+
+@pytest.mark.slow
+def test_moves_from_the_best_minima_of_starts():
+    how = {**UP_AND_DOWN, "moves": "insert split", "elements": 2}
+    plate = singlet().replace(2, curvature=None)
+    found = rt.search(plate, starts=4, **how)
+    assert (found.elements == 2).all()
+    assert all(task.split(" > ")[0].endswith(("followed", "hop 0", "hop 1", "hop 2", "hop 3")) for task in found.tasks)
 
 
 # -- a curriculum ------------------------------------------------------------------------------------------------------
@@ -446,8 +609,8 @@ def test_a_curriculum_refuses_what_it_cannot_begin_with(lens, hold, said):
 def test_unknown_kinds_and_other_ways_beside_a_kind_are_refused(phone_plates):
     with pytest.raises(NoProblem, match="expected phone"):
         rt.search(phone_plates, kind="fone", hold="efl=6")
-    with pytest.raises(NoProblem, match="exclude one another"):
-        rt.search(phone_plates, kind="phone", insert=True)
+    with pytest.raises(NoProblem, match="goes without"):
+        rt.search(phone_plates, kind="phone", moves="insert")
     with pytest.raises(NoProblem, match="a merit function of its own"):
         rt.search(phone_plates, kind="phone", hold="efl=6", merit="wavefront")
 
@@ -592,6 +755,9 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
     assert "keeps a search of other seed" in other.error
 
 
+MOVES = ["--merit", "spot", "--vary", "curvature sensor", "--hold", "efl=50", "--moves"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -604,17 +770,19 @@ def test_the_command_writes_its_minima_and_resumes(command_line, tmp_path):
         ),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
-        (
-            ["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"],
-            "--starts, --insert, --delete and --kind exclude one another",
-        ),
-        (["--merit", "spot", "--vary", "curvature", "--insert", "3"], "surface 3 is none before the image"),
-        (["--merit", "spot", "--vary", "curvature:1", "--insert", "2"], "has a curvature that does not vary"),
-        (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
-        (["--merit", "spot", "--vary", "thickness", "--delete"], "no spherical element between air"),
-        (["--merit", "spot", "--vary", "curvature", "--delete", "2"], "begins no element"),
-        (["--merit", "spot", "--vary", "curvature", "--delete", "1"], "begins the element that is the stop"),
-        (["--merit", "spot", "--vary", "curvature", "--delete", "--insert"], "exclude one another"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "insert:3"], "surface 3 is none before the image"),
+        (["--merit", "spot", "--vary", "curvature:1", "--moves", "insert:2"], "has a curvature that does not vary"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "insrt"], "did you mean insert?"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "delete:2"], "begins no element"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "delete:1"], "begins the element that is the stop"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "split:2"], "surface 2 begins no element"),
+        (["--merit", "spot", "--vary", "curvature", "--moves", "cement:1"], "no air space between two glasses"),
+        (["--merit", "spot", "--vary", "curvature", "--elements", "2"], "--elements goes with --moves"),
+        ([*MOVES, "insert", "--keep", "2"], "--keep goes with --elements"),
+        ([*MOVES, "insert:1", "--elements", "2"], "surfaces are those of the lens"),
+        ([*MOVES, "insert", "--elements", "1:"], "expected numbers of elements from 1 on, as 4"),
+        ([*MOVES, "cement", "--elements", "2"], "the lens has 1; more are made by --moves insert split"),
+        ([*MOVES, "cement"], "no air space between two glasses whose facing curvatures"),
     ],
 )
 def test_errors_of_search_are_one_line(words, said, plate, command_line, tmp_path):

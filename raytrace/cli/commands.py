@@ -168,6 +168,8 @@ EDITS: tuple[tuple[str, Reader | None, str | tuple[str, ...], str | int | None, 
     ("join", None, "SURFACES", "*", "take out surfaces that do nothing, and add the thicknesses"),
     ("split", None, "SURFACES", "*", "cut an element into two of the same power together: share=0.5 of the thickness, "
      "gap=0 mm, curvature=0 of the first face; of one surface: a meniscus without thickness before it"),
+    ("cement", None, "SURFACES", "*", "make one surface of the two of an air space, as 2-3, of their mean curvature, "
+     "or of curvature=0.02"),
     ("bend", None, "SURFACES X", "+", "the element of the shape factor X and the same power; keep=thin: its power "
      "without thickness"),
     ("semi_diameters", None, "SURFACES", "*", "semi-diameters by the rays of all fields, wavelengths and "
@@ -316,7 +318,7 @@ COMMANDS = (
     ),
     _command(
         "edit",
-        "scale, reverse, split, bend, insert, delete, semi-diameters, temperatures",
+        "scale, reverse, split, cement, bend, insert, delete, semi-diameters, temperatures",
         """\
 Edit a lens and write it: edits are carried out in the order given, and each numbers the surfaces as the edits before
 have left them. SURFACES are a number, the first and the last one as 3-6, or the comment of a surface: "front doublet"
@@ -331,6 +333,7 @@ that is gone is left out and named in a warning. Focal length, track and F-numbe
         double_gauss --reverse 3-5 -o flipped.zmx
         relay.zmx --swap-conjugates -o backwards.zmx
         cooke_triplet --split 1-2 gap=0.1 --bend 1-2 1 -o four.zmx
+        lens.zmx --cement 2-3 -o doublet.zmx
         lens.zmx --at "front doublet" --reverse --comment "front doublet, turned" -o turned.zmx
         lens.zmx --semi-diameters margin=2,0.5 chip_zone=0.5 --semi-diameters 1-2 mechanical=12.7 -o sized.zmx
         lens.zmx --system f_number=4 fields=0,7,10 ray_aiming=real --conditions efl=100 'edge>=1' -o specified.zmx
@@ -543,29 +546,32 @@ on request: {", ".join(ON_REQUEST)}""",
         "find the minima of a merit function globally, within bounds",
         "Find the distinct minima of a merit function, the file's or the one of --merit, within the bounds of the "
         "variables. Evenly distributed starts (plane plates suffice) are scaled to the focal length, focused and "
-        "optimised; the best are converged, and the search hops on from the best minima. Instead --insert adds an "
-        "element, as a thin meniscus at a surface is a saddle point that leads to new minima, and --delete removes "
-        "each element in turn. --as-built orders the minima by the merit with the expected spot of the manufactured "
-        "lens, and lists both. -o stores every minimum as a lens file, a table, figures and the state of the search: "
-        "the same command resumes there bit-identically. "
+        "optimised; the best are converged, and the search hops on from the best minima. --moves insert, split, "
+        "cement or delete elements of the lens, or with --starts of the best minima, and --elements asks for the best "
+        "lens of every number of elements. --as-built orders the minima by the merit with the expected spot of the "
+        "manufactured lens, and lists both. -o stores every minimum as a lens file, a table, figures and the state of "
+        "the search: the same command resumes there bit-identically. "
         "Ctrl-C stops and keeps the minima found. Processes share the work: "
         "torchrun --nproc-per-node 2 -m raytrace search …",
         """
         lens.zmx --starts 200 --seconds 60 -o minima
         cooke_triplet --merit spot --vary curvature thickness --hold efl=100 --edge 1 --seconds 20 -o minima
         cooke_triplet --merit spot --vary curvature sensor --hold efl=100 --starts 32 --as-built --grade precision
-        triplet.zmx --insert 2 4 -o four_elements
-        double_gauss --merit spot --vary curvature thickness --hold efl=100 --edge 1 --delete -o fewer
+        triplet.zmx --moves insert:2,4 split -o four_elements
+        double_gauss --merit spot --vary curvature thickness --hold efl=100 --edge 1 --moves delete -o fewer
+        triplet.zmx --moves insert delete --elements 2:5 -o two_to_five
         phone_plates --kind phone --hold efl=6 -o phone
         singlet --merit spot --vary curvature sensor --starts 8 --plot minima.png""",
         *LENS, "ray_aiming", *MERIT, FREEDOM, AS_BUILT,
         group(
             "extent",
-            Option("starts", count, "N", "initial designs (default 64)"),
-            Option("insert", count, "SURFACE", "instead of starts: insert a thin meniscus at every surface, or at "
-                "these", nargs="*"),
-            Option("delete", count, "SURFACE", "instead of starts: remove each element, or those of these first "
-                "surfaces, flattened and thinned while the rest follows", nargs="*"),
+            Option("starts", count, "N", "initial designs (default 64; with --moves none: the lens itself)"),
+            Option("moves", None, "MOVE", "from the lens, or with --starts from the best minima: insert a thin "
+                "meniscus at every surface, split or delete every element, cement facing surfaces of nearly equal "
+                "curvature; of some surfaces, as insert:2,4", nargs="+"),
+            Option("elements", None, "N[:M]", "numbers of elements, as 5 or 2:5: moves from the best lenses of each "
+                "number to the next, up and then down (default: each move once)"),
+            Option("keep", count, "N", "of --elements: best lenses of each number, from which moves begin (default 2)"),
             "seconds",
             Option("kind", None, None, "phone: from plates of plastic to a wide and fast lens of aspheres, in steps",
                 choices=("phone",)),

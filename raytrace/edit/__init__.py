@@ -2,7 +2,7 @@
 
 scaling     `scale`: by a factor, or to an effective focal length
 turning     `reverse`: the whole lens, or a group of its surfaces, turned around
-surfaces    `insert`, `delete`, `join`, `split`, `bend`, `rename`
+surfaces    `insert`, `delete`, `join`, `split`, `cement`, `bend`, `rename`
 sizes       `semi_diameters`: by the rays, with margin, chip zones and mechanical semi-diameters
 choice      surfaces by number, range or comment; the error and the warnings of edits
 numbering   new numbers in solves, pickups, configurations, merit rows and tolerances

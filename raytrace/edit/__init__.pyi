@@ -3,6 +3,7 @@ from raytrace.edit.parts import replace_part as replace_part
 from raytrace.edit.scaling import scale as scale
 from raytrace.edit.sizes import semi_diameters as semi_diameters
 from raytrace.edit.surfaces import bend as bend
+from raytrace.edit.surfaces import cement as cement
 from raytrace.edit.surfaces import delete as delete
 from raytrace.edit.surfaces import insert as insert
 from raytrace.edit.surfaces import join as join

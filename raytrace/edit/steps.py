@@ -7,7 +7,7 @@ from raytrace.edit.choice import At, BadEdit, surfaces_at
 from raytrace.edit.parts import insert_part, part_of_words, replace_part
 from raytrace.edit.scaling import scale
 from raytrace.edit.sizes import semi_diameters
-from raytrace.edit.surfaces import bend, delete, insert, join, rename, split
+from raytrace.edit.surfaces import bend, cement, delete, insert, join, rename, split
 from raytrace.edit.turning import reverse
 from raytrace.maths.numerics import value
 from raytrace.maths.result import Column, Result, Table, number
@@ -121,6 +121,11 @@ def _reverse(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
 def _split(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
     surfaces, _, settings = _chosen(words, chosen, "split")
     return split(lens, surfaces, **_known(settings, ("share", "gap", "curvature"), "split"))
+
+
+def _cement(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
+    surfaces, _, settings = _chosen(words, chosen, "cement")
+    return cement(lens, surfaces, **_known(settings, ("curvature",), "cement"))
 
 
 def _bend(lens: Lens, words: Sequence[str], chosen: str) -> Lens:
@@ -254,6 +259,7 @@ STEPS: dict[str, Callable[[Lens, Any, str], Lens]] = {
     "delete": _of_surfaces(delete, "delete"),
     "join": _of_surfaces(join, "join"),
     "split": _split,
+    "cement": _cement,
     "bend": _bend,
     "semi_diameters": _semi_diameters,
     "temperatures": _temperatures,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.edit.choice import At, BadEdit, LeftOut, surfaces_at, warn_of
-from raytrace.edit.numbering import Numbering
+from raytrace.edit.numbering import GAP, Numbering
 from raytrace.materials.glass import is_air
 from raytrace.maths.numerics import as_tensor
 from raytrace.system import prescription
@@ -210,8 +210,8 @@ def split(
     one of a `curvature` in 1/mm, a plane by default. The other has the curvature with which both parts together have
     the power of the element at the primary wavelength: without a gap the same one, so that no ray changes.
 
-    The meniscus has the shape of the surface and the adjacent glass, and changes no ray: `rt.search(insert=…)` begins
-    with it. Raises BadEdit for other than centred refracting surfaces.
+    The meniscus has the shape of the surface and the adjacent glass, and changes no ray: `rt.search(moves="insert")`
+    begins with it. Raises BadEdit for other than centred refracting surfaces.
     """
     first, last = surfaces_at(lens, surfaces)
     if first == last:
@@ -241,6 +241,59 @@ def split(
     ]
     new = inserted(lens, k + 1, faces)
     return new.replace(k, thickness=parts[0])
+
+
+def cement(lens: Lens, surfaces: At, *, curvature: Tensor | float | None = None) -> Lens:
+    """The lens with two elements cemented: the facing surfaces of an air space, as "2-3", become one, without air.
+
+    The shared surface has a `curvature` in 1/mm, by default the mean of both; what follows moves forward by the air
+    space. What refers to the second surface or to the air space is left out, in one warning (`LeftOut`); a stop at
+    either surface is at the shared one. Raises BadEdit for other than centred refracting spheres with air between two
+    different glasses.
+    """
+    first, last = surfaces_at(lens, surfaces)
+    where = f"cement {first}-{last}"
+    if last != first + 1:
+        raise BadEdit(f"{where}: expected the two surfaces of an air space, as {first}-{first + 1}")
+    for k in (first, last):
+        if why := _objection(lens, k):
+            raise BadEdit(f"{where}: surface {k} {why}")
+    if why := no_air_space(lens, first):
+        raise BadEdit(f"{where}: {why}")
+    new, numbering = cemented(lens, first)
+    if curvature is not None:
+        new = new.replace(first, curvature=as_tensor(curvature, dtype=lens.surfaces[first].thickness.dtype))
+    warn_of(LeftOut, f"{where}: left out with the air space", numbering.lost)
+    return new
+
+
+def no_air_space(lens: Lens, k: int) -> str:
+    """Why surfaces k and k + 1 cannot become one cemented surface, "" where they can."""
+    faces = lens.surfaces[k : k + 2]
+    if not is_air(faces[0].glass) or is_air(faces[1].glass) or is_air(medium_before(lens, k).glass):
+        return "no air space between two glasses"
+    if same(medium_before(lens, k).glass, faces[1].glass):
+        return f"both elements are of {faces[1].glass.name}; cemented they were one element"
+    if any(part is not None for face in faces for part in (face.conic, face.coefficients, face.sag_terms)):
+        return "expected spheres"
+    return ""
+
+
+def cemented(lens: Lens, k: int) -> tuple[Lens, Numbering]:
+    """The lens with surfaces k and k + 1 as one, of their mean curvature, as `cement`, and the numbering."""
+    front, back = lens.surfaces[k : k + 2]
+    curvature = 0.5 * (vertex_curvature(front) + vertex_curvature(back))
+    gap = {name: getattr(back, name) for name in GAP}
+    shared = dataclasses.replace(front, curvature=curvature, expansion=back.expansion, **gap)
+    numbers = [number if number <= k else number - 1 for number in range(len(lens.surfaces))]
+    places: list[int | None] = [*numbers[: k + 1], None, *numbers[k + 2 :]]
+    gaps: list[int | None] = [*numbers[:k], None, k, *numbers[k + 2 :]]
+    numbering = Numbering(lens, tuple(places), tuple(gaps))
+    surfaces = (*lens.surfaces[:k], shared, *lens.surfaces[k + 2 :])
+    stop = k if lens.stop == k + 1 else None
+    new = numbering.with_surfaces(surfaces, stop=stop)
+    check(new)
+    return new, numbering
 
 
 def _power(strengths: Sequence[Tensor], gaps: Sequence[Tensor]) -> Tensor:

@@ -19,7 +19,8 @@ loss              losses: spots first, descents, restarts, check by denser rays;
 optimized         `Optimized`, the result of `optimize`; `optimized_figure`: its figure
 checkpoint        state of a descent, from which it resumes
 glass_choice      variable glasses of catalogs
-search            `search`: minima found globally; `search_tasks`, `saddle_points`: its parts
+search            `search`: minima found globally; `search_tasks`: its parts; `loss_minima`: minima of a loss from there
+lens_moves        the search by moves: `moves`, `saddle_points` (insert, split), `removal` (delete, cement)
 file_check        `check`: import report of a lens file, and which operands are evaluated
 
 A new operand is a function of an `EvaluationContext` and a row of the table at the end of its family's file; its test

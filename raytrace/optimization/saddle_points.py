@@ -1,84 +1,77 @@
-"""Insertion: from a minimum over saddles to minima of lenses with one element more, two from every surface.
+"""Insertion and splitting: from a minimum to minima of lenses with one element more.
 
-A meniscus without thickness makes a saddle of the minimum. On either side of it all but the new thicknesses vary; then
-these grow in parts of their minimum values while the lens follows; at last everything varies.
+New surfaces are added where they change no ray: a meniscus without thickness at a surface, or an element cut into two
+without air between them. At first all but the new gaps without thickness vary; then these grow in parts of their least
+thicknesses, each part projected (`moves`), while the lens follows.
 
-Before surface k between air and a glass two more surfaces of its shape are inserted, so that a lens of the same glass,
-without thickness, touches it. The merit is unchanged along two lines of the curvatures (c₁, c₂, c₃) of the three,
+Insertion. Before surface k between air and a glass two more surfaces of its shape are inserted, so that a lens of the
+same glass, without thickness, touches it. The merit is unchanged along two lines of the curvatures (c₁, c₂, c₃) of the
+three,
 
     c₁ = c₂, c₃ = c_k      and      c₁ = c_k, c₂ = c₃
 
 and where the lens is a minimum, its slope along (1, 1, 1) vanishes as well: all three vanish, and along the two lines
 the merit is flat while it is not between them. So the lens is a saddle with one descent direction, to two sides.
 
+Splitting. An element of curvatures c₁ and c₂ is cut by two faces of curvature (c₁ + c₂)/2, so that both parts have half
+of its power as thin lenses.
+
 Source: Bociort & van Turnhout, Generating saddle points in the merit function landscape of optical systems, Proc. SPIE
 5962, 2005; van Turnhout & Bociort, Instabilities and fractal basins of attraction in optical system optimization,
 Opt. Express 17, 2009.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy.linalg import null_space
 
-from raytrace.edit.surfaces import as_inserted, with_meniscus
+from raytrace.edit.surfaces import as_inserted, split, with_meniscus
 from raytrace.materials.glass import is_air
 from raytrace.optimization.least_squares import SolverOptions, SumOfSquares
-from raytrace.optimization.one_element import Move, conditions_renumbered, thinned
-from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.optimization.search_tasks import (
-    FOLLOW,
-    LONG,
-    SearchProblem,
-    Stage,
-    TaskResult,
-    descended,
-)
-from raytrace.optimization.variables import DesignVariables
+from raytrace.optimization.moves import Move, changed, met, no_sphere, projected, thinned, with_gaps
+from raytrace.optimization.problem import Problem
+from raytrace.optimization.search_tasks import SearchProblem, Stage, TaskResult, descended
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import sensor
-from raytrace.system.surface import is_posed
 from raytrace.words import option
 
 _NEAR = 0.01  # relative change of the residuals by a step along a variable, for second derivatives
 _ACTIVE = 1e-9  # up to which a limit counts as reached
 
 
-# -- surfaces for a meniscus -------------------------------------------------------------------------------------------
+# -- where an element is added -----------------------------------------------------------------------------------------
 
 
-def surfaces_of(free: DesignVariables, surfaces: Sequence[int] = ()) -> tuple[int, ...]:
-    """All surfaces before which a meniscus can be inserted, or the given ones, checked. Raises NoProblem."""
-    lens = free.lens
-    if lens.operands:
-        raise NoProblem(f"{option('insert')}: the lens has several configurations; take one of them")
-    if not surfaces:
-        surfaces = tuple(k for k in range(1, sensor(lens) + 1) if not _objection(free, k))
-        if not surfaces:
-            raise NoProblem(f"{option('insert')}: no spherical surface between glass and air whose curvature varies")
-        return surfaces
-    for k in surfaces:
-        if objection := _objection(free, k):
-            raise NoProblem(f"{option('insert')}: surface {k} {objection}")
-    return tuple(dict.fromkeys(surfaces))
-
-
-def _objection(free: DesignVariables, k: int) -> str:
+def no_insertion(task: SearchProblem, lens: Lens, k: int) -> str:
     """The reason why no meniscus can be inserted before a surface, "" where it can."""
-    lens = free.lens
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
     surface, before = lens.surfaces[k], lens.surfaces[k - 1]
-    shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
-    if surface.is_mirror or before.is_mirror or any(part is not None for part in shaped) or is_posed(surface):
+    if no_sphere(surface) or before.is_mirror:
         return "is not a centred refracting sphere"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
         return "is not between glass and air"
-    varies = any(variable.address == (k, "curvature") for variable in free.variables)
+    varies = any(variable.address == (k, "curvature") for variable in task.model.variables)
     return "" if varies else f"has a curvature that does not vary: name it by {option('vary')}"
+
+
+def no_split(task: SearchProblem, lens: Lens, k: int) -> str:
+    """The reason why the element whose first surface is k cannot be split, "" where it can."""
+    if not 1 <= k < sensor(lens):
+        return f"begins no element: this lens has surfaces 1 to {sensor(lens)}"
+    if is_air(lens.surfaces[k].glass) or lens.surfaces[k - 1].is_break or not float(lens.surfaces[k].thickness) > 0:
+        return "begins no element"
+    if any(no_sphere(face) for face in lens.surfaces[k : k + 2]):
+        return "begins an element with other than centred refracting spheres"
+    if not {(face, "curvature") for face in (k, k + 1)} & {variable.address for variable in task.model.variables}:
+        return f"begins an element of curvatures that do not vary: name them by {option('vary')}"
+    solved = {(solve.surface, solve.quantity) for solve in task.model.solves}
+    solved |= {solve.address_of_source for solve in task.model.solves if solve.kind == "pickup"}
+    return "begins an element whose thickness a solve or a pickup uses" if (k, "thickness") in solved else ""
 
 
 # -- the lens with one element more ------------------------------------------------------------------------------------
@@ -86,27 +79,25 @@ def _objection(free: DesignVariables, k: int) -> str:
 
 def enlarged(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
     """The search problem of the lens with a meniscus in front of surface k."""
-    made, free, numbering = with_meniscus(lens, k), task.model, as_inserted(lens, k, 2)
-    new = [Vary(s, quantity) for quantity in ("curvature", "thickness") for s in (k, k + 1)]
-    old = numbering.variables(free.variables)
-    bounds = {variable: (least, most) for variable, least, most in zip(old, *task.bounds, strict=True)}
-    steep = bounds[next(variable for variable in old if variable.address == (k + 2, "curvature"))]
-    bounds |= {variable: steep if variable.quantity == "curvature" else (-np.inf, np.inf) for variable in new}
-    quantities = list(dict.fromkeys(variable.quantity for variable in (*new, *old)))
-    variables = tuple(sorted(bounds, key=lambda variable: (quantities.index(variable.quantity), variable.surface)))
-    solves = numbering.solves(free.solves)
-    if (data := made.optimization_data) is not None:
-        made = replace(made, optimization_data=replace(data, variables=variables, solves=solves))
-    return replace(
-        task,
-        model=DesignVariables(made, variables, solves),
-        rows=numbering.rows(task.rows),
-        conditions=conditions_renumbered(task.conditions, numbering),
-        bounds=(
-            np.array([bounds[variable][0] for variable in variables], dtype=float),
-            np.array([bounds[variable][1] for variable in variables], dtype=float),
-        ),
-    )
+    return _with_surfaces(with_meniscus(lens, k), lens, task, k)
+
+
+def divided(lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
+    """The search problem of the lens with the element of surfaces k and k + 1 in two, without air between them."""
+    faces = [surface.curvature for surface in lens.surfaces[k : k + 2]]
+    mean = 0.5 * sum(0.0 if curvature is None else float(curvature) for curvature in faces)
+    return _with_surfaces(split(lens, (k, k + 1), curvature=mean), lens, task, k + 1)
+
+
+def _with_surfaces(made: Lens, lens: Lens, task: SearchProblem, k: int) -> SearchProblem:
+    """The search problem of a lens with two more surfaces before surface k, which vary with the gaps behind them."""
+    numbering = as_inserted(lens, k, 2)
+    ends = dict(zip((variable.address for variable in task.model.variables), zip(*task.bounds, strict=True),
+                    strict=True))  # fmt: skip
+    free = (-np.inf, np.inf)
+    steep = ends.get((k, "curvature"), ends.get((k - 1, "curvature"), free))
+    new = {Vary(s, "curvature"): steep for s in (k, k + 1)} | {Vary(s, "thickness"): free for s in (k, k + 1)}
+    return changed(task, made, numbering, new, with_gaps(task.rows, numbering, k, 2))
 
 
 # -- the saddle --------------------------------------------------------------------------------------------------------
@@ -164,38 +155,40 @@ def _conditions(state: SumOfSquares, like: SumOfSquares | None = None) -> np.nda
     return np.concatenate([state.held_slope, state.limits_slope[reached]])
 
 
-SIDES = {"one side": 1.0, "other side": -1.0}
-_PARTS = 0.25, 0.5, 0.75, 1.0  # of the least thicknesses, one after the other
+# -- the moves ---------------------------------------------------------------------------------------------------------
+
+_SIDES = {"one side": 1.0, "other side": -1.0}
+_PARTS = 0.5, 1.0  # of the least thicknesses, one after the other
 _OFF = np.geomspace(0.03, 10, 18)  # of the residuals: steps off the saddle that are tried
-_CYCLES = 15, 10  # off the saddle, and with every part of the thickness
+_CYCLES = 8, 6  # without thickness, and with every part of it
 _CAREFUL = SolverOptions(damping=0.1, bends=False)
-_MEETINGS = 4  # of conditions, after a step off the saddle
 
 
 @dataclass(frozen=True)
-class Place:
-    """A lens with a meniscus before surface k: its problems by how much of its least thickness it has."""
+class Enlargement:
+    """A lens with new gaps, from the first to the last: its problems by the part of the least thicknesses that they
+    have; empty: those that have no thickness yet."""
 
-    k: int
+    gaps: tuple[int, int]
+    empty: tuple[int, ...]
     task: SearchProblem
 
     def stage(self, part: float, cycles: int, options: SolverOptions) -> Stage:
-        """The descent with a part of the least thicknesses; with a part of 0 the new gaps stay at 0."""
-        space, new = self.task.space, (self.k, self.k + 1)  # the meniscus and the adjacent air
-        gaps = np.array(
-            [variable.quantity == "thickness" and variable.surface in new for variable in self.task.model.variables]
-        )
-        lower = np.where(gaps, part * space.lower, space.lower)
-        upper = np.where(gaps & (part == 0), 0.0, space.upper)
-        problem = self.task.problem(thinned(self.task.rows, (self.k, self.k + 1), part))
-        return Stage(problem, cycles, options, lower, upper)
+        """The descent with a part of the least thicknesses; with a part of 0 the empty gaps stay at 0."""
+        space = self.task.space
+        behind = [v.surface if v.quantity == "thickness" else -1 for v in self.task.model.variables]
+        thin, empty = np.isin(behind, range(self.gaps[0], self.gaps[1] + 1)), np.isin(behind, self.empty)
+        lower = np.where(thin, part * space.lower, space.lower)
+        upper = np.where(empty & (part == 0), 0.0, space.upper)
+        return Stage(self.task.problem(thinned(self.task.rows, self.gaps, part)), cycles, options, lower, upper)
 
-    def gone(self, sign: float, until: float = np.inf) -> TaskResult:
-        """The minimum on one side of the saddle, of a lens of real thickness. Raises SearchStopped."""
-        first = self.stage(0.0, _CYCLES[0], _CAREFUL)
+    def taken(self, until: float = np.inf, *, sign: float = 0.0) -> TaskResult:
+        """Variables near the minimum of a lens of real thickness; sign: off a saddle, to one side. Raises
+        SearchStopped."""
+        first, start = self.stage(0.0, _CYCLES[0], _CAREFUL), self.task.model.start
+        x = self.displaced(first, sign) if sign else start
         thicker = [self.stage(part, _CYCLES[1], _CAREFUL) for part in _PARTS]
-        x = self.displaced(first, sign)
-        return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
+        return descended(x, [first, *thicker], until, projected(self.task.space, start))
 
     def displaced(self, stage: Stage, sign: float) -> np.ndarray:
         """Variables (n,) off the saddle to one side, as far as the merit falls, with the conditions met again."""
@@ -206,37 +199,24 @@ class Place:
         unit = np.sqrt(problem.state(x, False).cost) / np.linalg.norm(columns * way)
         best, least = x + _OFF[0] * unit * way, np.inf
         for size in _OFF:
-            trial = self._met(stage, x + size * unit * way)
+            trial = met(stage, x + size * unit * way)
             state = problem.state(trial, False)
             if not state.is_finite or state.lost or state.cost >= least:
                 break
             best, least = trial, state.cost
         return best
 
-    def _met(self, stage: Stage, x: np.ndarray) -> np.ndarray:
-        """x with the equalities met, by the shortest steps."""
-        x = np.clip(x, stage.lower, stage.upper)
-        moves = stage.moves(x)
-        for _ in range(_MEETINGS):
-            state = stage.problem.state(x, True)
-            if not len(state.held) or not state.is_finite:
-                return x
-            columns = np.sqrt((state.jacobian**2).sum(0))
-            scale = np.where(columns > 0, columns, 1.0)
-            back = np.linalg.lstsq((state.held_slope / scale)[:, moves], state.held, rcond=None)[0]
-            x = x.copy()
-            x[moves] -= back / scale[moves]
-            x = np.clip(x, stage.lower, stage.upper)
-        return x
+
+def insertions(task: SearchProblem, lens: Lens, places: Sequence[int]) -> Iterator[Move]:
+    """A meniscus at each surface of a lens at its minimum, on both sides of the saddle."""
+    for k in places:
+        thin = Enlargement((k, k + 1), (k, k + 1), enlarged(lens, task, k))
+        for side, sign in _SIDES.items():
+            yield Move(f"insert {k}, {side}", thin.task, partial(thin.taken, sign=sign))
 
 
-def insertions(task: SearchProblem, places: Sequence[int]) -> Callable[[Lens], Iterator[Move]]:
-    """The moves from a minimum of a search problem: a meniscus at each surface, and the descents on both sides."""
-
-    def moves(lens: Lens) -> Iterator[Move]:
-        for k in places:
-            place = Place(k, enlarged(lens, task, k))
-            descents = [(f"surface {k}, {side}", partial(place.gone, sign)) for side, sign in SIDES.items()]
-            yield Move(place.task, descents)
-
-    return moves
+def splits(task: SearchProblem, lens: Lens, places: Sequence[int]) -> Iterator[Move]:
+    """Each element of a lens at its minimum, by its first surface, in two."""
+    for k in places:
+        cut = Enlargement((k, k + 2), (k + 1,), divided(lens, task, k))
+        yield Move(f"split {k}", cut.task, cut.taken)

@@ -32,9 +32,10 @@ from raytrace.optimization.conditions import Condition, conditions_in_unit, spec
 from raytrace.optimization.contradictions import refuse_contradictions
 from raytrace.optimization.curriculum import Growth, Plan
 from raytrace.optimization.least_squares import SolverOptions
-from raytrace.optimization.loss import Loss, LossDescents
+from raytrace.optimization.lens_moves import LensMoves, Moves, counts
+from raytrace.optimization.loss import Loss
+from raytrace.optimization.loss_minima import ByLoss
 from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, in_unit
-from raytrace.optimization.one_element import FromLens
 from raytrace.optimization.opening import opened
 from raytrace.optimization.optimized_figure import drawn_fields
 from raytrace.optimization.problem import (
@@ -45,8 +46,6 @@ from raytrace.optimization.problem import (
     optimization_data_of,
 )
 from raytrace.optimization.quantities import Quantity, quantity_of
-from raytrace.optimization.removal import elements_of, removals
-from raytrace.optimization.saddle_points import SIDES, insertions, surfaces_of
 from raytrace.optimization.search_tasks import (
     FOLLOW,
     LONG,
@@ -62,7 +61,6 @@ from raytrace.optimization.search_tasks import (
 )
 from raytrace.optimization.variables import bounds_of, design_variables
 from raytrace.plotting import style
-from raytrace.psf_models import EmptyPsf
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
@@ -79,7 +77,7 @@ if TYPE_CHECKING:
 #: Why a search ends.
 STOPPED = {
     "starts": "all starts were tried",
-    "surfaces": "all moves from the lens were followed",
+    "moves": "all moves were taken",
     "steps": "all steps were taken",
     "seconds": "the limit on time was reached",
     "interrupted": "interrupted; these were found so far",
@@ -100,7 +98,8 @@ class Searched(Result):
     descents that were followed to their end. as_built: (M, 3) the merit with the lens as built, by which the minima are
     ordered, nan where a perturbed lens fails; and RMS spot radius in mm, expected (the root of the mean square) and of
     the refocused lens without errors; tolerances: of which errors. loss: (M,), by which the minima are ordered, nan of
-    those that were not followed to a minimum of the loss.
+    those that were not followed to a minimum of the loss. elements, groups: (M,) numbers of elements and of groups of
+    them, of a search by moves.
     """
 
     before: Lens
@@ -121,6 +120,8 @@ class Searched(Result):
     as_built: Tensor | None = None
     tolerances: str = ""
     loss: Tensor | None = None
+    elements: Tensor | None = None
+    groups: Tensor | None = None
 
     @property
     def found(self) -> Tensor:
@@ -132,11 +133,25 @@ class Searched(Result):
         """The best one."""
         return self.lenses[0]
 
+    @property
+    def of_elements(self) -> dict[int, Lens]:
+        """The best lens of every number of elements, of a search by moves."""
+        return {int(self.elements[k]): self.lenses[k] for k in reversed(self._best)} if self._best else {}
+
+    @property
+    def _best(self) -> list[int]:
+        """The numbers of the best lenses of every number of elements, the best first."""
+        listed = [] if self.elements is None else self.elements.tolist()
+        return [k for k, number in enumerate(listed) if number not in listed[:k]]
+
     def columns(self) -> dict[str, Tensor]:
         fields = {f"rms_{f}_um": 1e3 * self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
         variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
         number = torch.arange(1, len(self.lenses) + 1)
-        of_lens = {"minimum": number, **({} if self.loss is None else {"loss": self.loss}), "merit": self.merit}
+        of_lens = {"minimum": number}
+        if self.elements is not None and self.groups is not None:
+            of_lens |= {"elements": self.elements, "groups": self.groups}
+        of_lens |= {**({} if self.loss is None else {"loss": self.loss}), "merit": self.merit}
         of_lens |= {"efl": self.focal_length, **fields, "between": self.between}
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
@@ -149,9 +164,10 @@ class Searched(Result):
 
     def tables(self) -> list[Table]:
         count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
+        begun = f"{self.starts} starts" if self.elements is None else f"{self.starts} moves"
         title = [
             self.before.name,
-            f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            f"  {count} from {begun} in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             f"  found: by how many of the {self.descents} descents that were followed to their end",
             "  between: the largest ratio of an RMS spot between fields, wavelengths or rays to those beside it",
             *([f"  in the order of the merit as built: {self.tolerances}"] if self.as_built is not None else []),
@@ -164,7 +180,10 @@ class Searched(Result):
             if name.startswith("rms_")
         }
         of_loss = {} if self.loss is None else {Column("loss"): self.loss}
-        shown = {Column("minimum"): columns["minimum"], **of_loss, Column("merit"): self.merit}
+        shown = {Column("minimum"): columns["minimum"]}
+        if self.elements is not None and self.groups is not None:
+            shown |= {Column("elements"): self.elements, Column("groups"): self.groups}
+        shown |= {**of_loss, Column("merit"): self.merit}
         if self.as_built is not None:
             merit, expected, nominal = self.as_built.unbind(-1)
             shown |= {Column("merit_as_built", heading="merit\nas built"): merit}
@@ -176,8 +195,10 @@ class Searched(Result):
 
     @style.styled
     def draw(self, **options: Any) -> "Figure":
-        """The best lenses on one scale, each with its merit, its spots and how many descents reached it."""
+        """The best lenses on one scale, first of every number of elements, each with its merit, its spots and how many
+        descents reached it."""
         count = min(_MOST, len(self.lenses))
+        order = [*self._best, *(k for k in range(len(self.lenses)) if k not in self._best)]
         columns = min(_COLUMNS, count)
         rows = -(-count // columns)
         figure = style.new_figure(3.6 * max(columns, 2), 2.5 * rows + 0.5)
@@ -187,7 +208,7 @@ class Searched(Result):
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for k, axes in enumerate(panels):
             if k < count:
-                _draw(axes, self, k)
+                _draw(axes, self, order[k])
             else:
                 axes.set_axis_off()
         on_one_scale([*panels[:count]])
@@ -224,6 +245,7 @@ def searched(
     stopped: str,
     seconds: float,
     as_built: ExpectationSettings | None = None,
+    of_moves: bool = False,
 ) -> Searched:
     """The result: minima, the best first, each with its problem, and their losses. Warns WorseBetween of the best."""
     terms: list[tuple[float, float, float]] = []
@@ -262,6 +284,8 @@ def searched(
         seconds=seconds,
         as_built=tensor(terms) if terms else None,
         tolerances=as_built.words() if as_built is not None and terms else "",
+        elements=torch.tensor([counts(of_minimum)[0] for of_minimum in lenses]) if of_moves else None,
+        groups=torch.tensor([counts(of_minimum)[1] for of_minimum in lenses]) if of_moves else None,
     )
 
 
@@ -354,8 +378,6 @@ _SHORT = 10, 12  # cycles on the narrow and on the whole beam
 _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
-_BY_LOSS = 8  # minima that are followed to minima of a loss, if it is at most so many times that of the best one there:
-_PROMISING = 2.0
 _REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
 _DAMPED = SolverOptions(damping=0.1, bends=False)
 
@@ -371,8 +393,9 @@ def search(
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = (),
     starts: int | None = None,
-    insert: bool | Sequence[int] | None = None,
-    delete: bool | Sequence[int] | None = None,
+    moves: str | Sequence[str] | None = None,
+    elements: int | str | Sequence[int] | None = None,
+    keep: int | None = None,
     seconds: float | None = None,
     seed: int = 0,
     as_built: ExpectationSettings | None = None,
@@ -386,18 +409,24 @@ def search(
     """The distinct minima of a merit function globally, within bounds; the lens is one of the starts.
 
     merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
-    which is that of `hold`, of a row EFFL or of the lens. starts: how many. Instead of starts, insert: True, or
-    surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
-    more (`saddle_points.py`); or delete: True, or first surfaces of elements, each of which is flattened and thinned
-    until it is gone, to lenses with one element less (`removal.py`). kind: "phone", a curriculum from plates of plastic
-    to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its focal
-    length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
+    which is that of `hold`, of a row EFFL or of the lens. starts: how many. kind: "phone", a curriculum from plates of
+    plastic to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its
+    focal length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
+    moves: words of moves from the lens at its minimum, or with `starts` from the best minima: "insert" a meniscus
+    without thickness at each surface, to descend on either side of a saddle, "split" each element into two
+    (`saddle_points.py`), "cement" facing surfaces of nearly equal curvature, "delete" each element, which is flattened
+    and thinned until it is gone (`removal.py`); of some surfaces as "insert:1,4 delete:3", by the first surface of an
+    element or an air space. After each change a paraxial projection restores power and defocus (`moves.py`). elements:
+    a number, or the smallest and the largest as "2:5": moves from the best `keep` (2) lenses of each number lead to the
+    next number, up to the largest, then down to the smallest; the result has the best `keep` of every number.
+    Without it all moves are taken once.
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens: the minima are those of
     the merit function alone, in the order of the merit with this term; of each lens with the tolerances of its own
     surfaces.
     loss, of, object_distances: as for `optimize`; of the eight best minima of the merit function those are followed to
     minima of the loss, in at most 120 cycles, whose loss is at most twice the least, between the same bounds and under
-    the same conditions; these are the result, in the order of the loss; merit and spots are those there.
+    the same conditions; these are the result, in the order of the loss; merit and spots are those there. With
+    `elements` these are the eight best of each number of elements, and lenses are kept by their loss.
     folder: keeps the minima as lens files, a table and figures, and the journal: called again the search resumes, with
     the same result as without the interruption. Ctrl-C ends with the minima so far; without any the nearest lens of all
     descents is written there.
@@ -414,12 +443,11 @@ def search(
     warn_of_filling(lens, field_points(None, like=lens))
     started = time.monotonic()
     until = started + (np.inf if seconds is None else seconds)
-    given = [asked for asked in (kind, insert, delete) if asked is not None and asked is not False]
-    if len(given) + (starts is not None and kind is None) > 1:
-        raise NoProblem(
-            f"{option('starts')}, {option('insert')}, {option('delete')} and {option('kind')} exclude one another, but "
-            f"for {option('starts')} of {option('kind')}"
-        )
+    if kind is not None and (moves is not None or elements is not None):
+        raise NoProblem(f"{option('kind', kind)} goes without {option('moves')} and {option('elements')}")
+    if moves is None and (elements is not None or keep is not None):
+        name = "elements" if elements is not None else "keep"
+        raise NoProblem(f"{option(name)} goes with {option('moves')}, as {option('moves', 'insert delete')}")
     plan = None
     if kind is not None:
         if merit is not None and not isinstance(merit, DefaultMerit):
@@ -442,19 +470,17 @@ def search(
     if task.conditions:
         low, high = task.space.lower, task.space.upper
         refuse_contradictions(task.whole, np.clip(task.model.start, low, high), lower=low, upper=high)
-    run: FromLens | Growth | _Run
-    if insert is not None and insert is not False:
-        surfaces = surfaces_of(task.model, () if insert is True else tuple(insert))
-        journal = Journal(folder, {**task.about(seed), "insert": list(surfaces)}, until)
-        run = FromLens(task, journal, insertions(task, surfaces), len(SIDES) * len(surfaces), "insert")
-    elif delete is not None and delete is not False:
-        elements = elements_of(task.model, task.conditions, () if delete is True else tuple(delete))
-        journal = Journal(folder, {**task.about(seed), "delete": list(elements)}, until)
-        run = FromLens(task, journal, removals(task, elements), len(elements), "delete")
+    run: LensMoves | Growth | _Run
+    taken = None if moves is None else Moves.of(moves, elements, keep, task)
+    about = task.about(seed) if plan is None else {**task.about(seed), "kind": kind}
+    if taken is not None:
+        about |= {**taken.about(), **({} if starts is None else {"starts": starts})}
+    journal = Journal(folder, about, until)
+    first = _Run(task, journal, seed, STARTS if starts is None else starts)
+    by_loss = None if measured is None else ByLoss(measured, journal)
+    if taken is not None:
+        run = LensMoves(task, journal, taken, None if starts is None else first, by_loss)
     else:
-        about = task.about(seed) if plan is None else {**task.about(seed), "kind": kind}
-        journal = Journal(folder, about, until)
-        first = _Run(task, journal, seed, STARTS if starts is None else starts)
         run = first if plan is None else Growth(plan, first, journal)
     stopped = run.DONE
     try:
@@ -467,13 +493,13 @@ def search(
         ended = run.ended if isinstance(run, Growth) else ()
         raise _without_minima(task, run.journal, run.started, folder if not (share and share.rank) else None, ended)
     losses: list[float] = []
-    if measured is not None:
-        each, losses = _followed_by_loss(each, measured, run.journal, progress)
+    if by_loss is not None:
+        each, losses = run.minima_of_loss(progress) if isinstance(run, LensMoves) else by_loss.listed(each, progress)
         if stopped == run.DONE and np.isnan(losses).any():
             stopped = "seconds" if time.monotonic() > until else "interrupted"
     result = searched(
-        lens, each, losses=losses, starts=run.started, descents=run.followed, stopped=stopped,
-        seconds=time.monotonic() - started, as_built=as_built,
+        lens, each, losses=losses, of_moves=taken is not None, starts=run.started, descents=run.followed,
+        stopped=stopped, seconds=time.monotonic() - started, as_built=as_built,
     )  # fmt: skip
     warn_of_defects(result.lens)
     if folder is not None and not (share and share.rank):
@@ -482,59 +508,6 @@ def search(
         except (OSError, LensFileError) as error:
             warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=calling_level())
     return result
-
-
-def _followed_by_loss(
-    each: Sequence[tuple[SearchProblem, Minimum]], loss: Loss, journal: Journal, progress: Callable | None
-) -> tuple[list[tuple[SearchProblem, Minimum]], list[float]]:
-    """The best minima at the minima of a loss that lie below them, and their losses, in its order; after an interrupt
-    the others behind them."""
-    key = f"loss {loss.words}"
-
-    def minimised(task: SearchProblem, x: np.ndarray) -> TaskResult:
-        begun = time.process_time()
-        descents = LossDescents(task.whole, loss, (task.space.lower, task.space.upper))
-        try:
-            end = descents.run(x, first=False, restarts=0, cycles=LONG, until=journal.until)
-        except (NoProblem, EmptyPsf):  # rays of the loss fail
-            return TaskResult(np.inf, np.inf, np.inf, time.process_time() - begun, x)
-        if end.stopped in ("interrupted", "seconds"):
-            raise SearchStopped
-        missed = float(task.whole.state(end.x, False).missed.max(initial=0.0))
-        value = end.report.end if np.isnan(end.report.checked) else end.report.checked
-        return TaskResult(0.0, missed, value, time.process_time() - begun, end.x)
-
-    @torch.no_grad()
-    def before(task: SearchProblem, minimum: Minimum) -> float:
-        try:
-            value = float(loss(task.model.lens_at(torch.tensor(minimum.result.x))))
-        except EmptyPsf:
-            value = np.nan
-        return value if np.isfinite(value) else np.inf
-
-    values = [before(*pair) for pair in each[:_BY_LOSS]]
-    most = min(values) + (_PROMISING - 1) * abs(min(values))
-    promising = [each[k] for k, value in enumerate(values) if value <= most]
-    others = [each[k] for k in range(len(each)) if k >= len(values) or values[k] > most]
-    ends: list[tuple[float, SearchProblem, Minimum]] = []
-    bar = None if progress is None else progress(len(promising), "descent")
-    try:
-        for task, minimum in promising:
-            x = minimum.result.x
-            (end,) = journal.each([(f"{minimum.task}, {key}", partial(minimised, task, x))], len(x))
-            merit = task.whole.merit(task.whole.evaluated(end.x), end.x)
-            ends.append((end.merit, task, replace(minimum, result=end._replace(merit=merit))))
-            if bar is not None:
-                bar.update(1)
-    except (SearchStopped, KeyboardInterrupt):
-        _LOG.info("the descents of the loss are not complete")
-    finally:
-        if bar is not None:
-            bar.close()
-    ends.sort(key=lambda end: end[0])
-    followed = [(task, minimum) for _, task, minimum in ends]
-    rest = [] if len(ends) == len(promising) else [*promising[len(ends) :], *others]
-    return [*followed, *rest], [value for value, _, _ in ends] + [np.nan] * len(rest)
 
 
 @dataclass

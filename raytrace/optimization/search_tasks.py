@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -98,20 +98,24 @@ class Journal:
             self.known[result["task"]] = TaskResult(**numbers, x=np.array(result["x"]))
             self.lines[result["task"]] = line
 
-    def each(self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]], count: int) -> list[TaskResult]:
-        """Results of tasks, a key and a function each, at (count,) variables. Raises SearchStopped."""
-        for key, _ in tasks:
+    def each(
+        self, tasks: Sequence[tuple[str, Callable[[], TaskResult]]], count: int | Sequence[int]
+    ) -> list[TaskResult]:
+        """Results of tasks, a key and a function each, at `count` variables, one number or that of each task. Raises
+        SearchStopped."""
+        counts = [count] * len(tasks) if isinstance(count, int) else list(count)
+        for (key, _), count in zip(tasks, counts, strict=True):
             if key in self.known and len(self.known[key].x) != count:  # of another number of variables
                 words = f"x: found a list of {len(self.known.pop(key).x)}, expected {count} of them"
                 place = f"{self.store.path}, line {self.lines[key]}"
                 warnings.warn(f"{place}: {words}; the line is ignored", DamagedLine, stacklevel=calling_level())
-        left = [(key, task) for key, task in tasks if key not in self.known]
+        left = [(key, task, count) for (key, task), count in zip(tasks, counts, strict=True) if key not in self.known]
         mine = share()
-        table = torch.zeros(len(left), 5 + count, dtype=torch.float64)
+        table = torch.zeros(len(left), 5 + max(counts, default=0), dtype=torch.float64)
         stopped = False
         with agreeing():
             for k in mine.of(range(len(left))):
-                key, task = left[k]
+                key, task, count = left[k]
                 try:
                     stopped = time.monotonic() > self.until
                     if stopped:
@@ -120,14 +124,14 @@ class Journal:
                 except (KeyboardInterrupt, SearchStopped):
                     stopped = True
                     break
-                table[k] = torch.tensor([1.0, *result[:4], *result.x], dtype=torch.float64)
+                table[k, : 5 + count] = torch.tensor([1.0, *result[:4], *result.x], dtype=torch.float64)
                 if mine.processes == 1:
                     self._add(key, result)
         if mine.processes > 1:
-            for (key, _), row in zip(left, total(table), strict=True):
+            for (key, _, count), row in zip(left, total(table), strict=True):
                 if row[0]:
                     lost, missed, merit, seconds = row[1:5].tolist()
-                    self._add(key, TaskResult(lost, missed, merit, seconds, row[5:].numpy()))
+                    self._add(key, TaskResult(lost, missed, merit, seconds, row[5 : 5 + count].numpy()))
         if stopped or any(key not in self.known for key, _ in tasks):
             raise SearchStopped
         return [self.known[key] for key, _ in tasks]
@@ -167,7 +171,7 @@ class Minima:
         """Add a result; whether it is new, or better than the minimum that it equals."""
         if not result.is_valid:
             return False
-        same = next((minimum for minimum in self.each if self._is_same(minimum.result, result)), None)
+        same = next((minimum for minimum in self.each if self.is_same(minimum.result, result)), None)
         better = same is None or result.merit < same.result.merit * (1 - 1e-6)
         if same is None:
             self.each.append(Minimum(result, task, seconds))
@@ -178,7 +182,8 @@ class Minima:
         self.each.sort(key=lambda minimum: minimum.result.merit)
         return better
 
-    def _is_same(self, result: TaskResult, other: TaskResult) -> bool:
+    def is_same(self, result: TaskResult, other: TaskResult) -> bool:
+        """Whether two results are of one minimum."""
         if abs(result.merit - other.merit) > _EQUAL * max(result.merit, other.merit):
             return False
         designs = [other.x]
@@ -196,6 +201,13 @@ _HALVINGS = 40
 _SPREAD = {"conic": (-2.0, 2.0), "index": (1.45, 1.9), "abbe_number": (20.0, 80.0)}
 
 Range = tuple[float, float] | None
+
+
+class Paraxial(NamedTuple):
+    """Paraxial properties of a lens: power, 1/mm, None where it is free; distance of the sensor from the focus, mm."""
+
+    power: float | None
+    defocus: float
 
 
 @dataclass(frozen=True)
@@ -221,33 +233,58 @@ class Space:
 
     def prepared(self, x: np.ndarray) -> np.ndarray:
         """x with its curvatures scaled to the focal length and the sensor at the paraxial focus, within bounds."""
-        x = np.clip(x, self.lower, self.upper)
-        if self.focal_length is not None:
-            x = np.clip(self._focused(x, self.focal_length), self.lower, self.upper)
-        last = sensor(self.model.lens), "thickness"
-        of_sensor = [k for k, variable in enumerate(self.model.variables) if variable.address == last]
-        if of_sensor:
-            state = self._state(x)
-            data = state.gaussian(state.primary)
-            height, omega = data.A + data.B * state.vergence, data.C + data.D * state.vergence
-            distance = float(-height * data.n_image / omega) if omega != 0 else np.nan
+        power = None if self.focal_length is None else 1 / self.focal_length
+        return self.restored(x, Paraxial(power, 0.0), self.lower, self.upper)
+
+    def paraxial(self, x: np.ndarray) -> "Paraxial":
+        """Power and defocus of the lens at x (n,)."""
+        at_sensor = self._sensor
+        defocus = 0.0 if at_sensor is None else float(x[at_sensor]) - self._image_distance(x)
+        return Paraxial(self._power(x), defocus)
+
+    def restored(self, x: np.ndarray, wanted: "Paraxial", lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """x within bounds (n,), with all curvatures that these leave free scaled to a power, or else the last of them
+        changed, and the sensor, where it is free, at a defocus."""
+        x, free = np.clip(x, lower, upper), upper > lower
+        if wanted.power:
+            x = np.clip(self._focused(x, wanted.power, free), lower, upper)
+        at_sensor = self._sensor
+        if at_sensor is not None and free[at_sensor]:
+            distance = self._image_distance(x) + wanted.defocus
             if np.isfinite(distance):
-                x[of_sensor[0]] = np.clip(distance, self.lower[of_sensor[0]], self.upper[of_sensor[0]])
+                x[at_sensor] = np.clip(distance, lower[at_sensor], upper[at_sensor])
         return x
+
+    @property
+    def _sensor(self) -> int | None:
+        """The number of the variable that is the distance of the sensor."""
+        last = sensor(self.model.lens), "thickness"
+        return next((k for k, variable in enumerate(self.model.variables) if variable.address == last), None)
+
+    def _image_distance(self, x: np.ndarray) -> float:
+        """Paraxial distance of the image from the last surface, mm; nan of a lens without one."""
+        state = self._state(x)
+        data = state.gaussian(state.primary)
+        height, omega = data.A + data.B * state.vergence, data.C + data.D * state.vergence
+        return float(-height * data.n_image / omega) if omega != 0 else np.nan
+
+    def _power(self, x: np.ndarray) -> float:
+        """Power in 1/mm, by the index of the image."""
+        state = self._state(x)
+        data = state.gaussian(state.primary)
+        return float(-data.C / abs(data.n_image))
 
     def _state(self, x: np.ndarray) -> LensState:
         return self.model.views[self.model.lens.current_configuration - 1].state(x)
 
-    def _focused(self, x: np.ndarray, focal_length: float) -> np.ndarray:
-        """x for a focal length: with all curvatures scaled by a factor, or else with the last curvature changed."""
+    def _focused(self, x: np.ndarray, power: float, free: np.ndarray) -> np.ndarray:
+        """x for a power: with all free curvatures scaled by a factor, or else with the last of them changed."""
 
         def excess(x: np.ndarray) -> float:
-            """Power beyond that of the focal length, in its units."""
-            state = self._state(x)
-            data = state.gaussian(state.primary)
-            return float(-data.C / abs(data.n_image) * focal_length - 1)
+            """Power beyond the wanted one, in its units."""
+            return self._power(x) / power - 1
 
-        curved = np.array([variable.quantity == "curvature" for variable in self.model.variables])
+        curved = free & np.array([variable.quantity == "curvature" for variable in self.model.variables])
         if not curved.any():
             return x
         scaled = lambda s: np.where(curved, s * x, x)  # noqa: E731
@@ -398,6 +435,10 @@ class SearchProblem:
         }
 
 
+#: A minimum with its problem.
+Found: TypeAlias = tuple[SearchProblem, Minimum]
+
+
 class Stage(NamedTuple):
     """A descent on a problem between bounds (n,), in at most so many cycles; typical: as for `least_squares`."""
 
@@ -414,14 +455,22 @@ class Stage(NamedTuple):
         return (x - self.lower > near) & (self.upper - x > near)
 
 
-def descended(x: np.ndarray, stages: Sequence[Stage], until: float = np.inf) -> TaskResult:
+def descended(
+    x: np.ndarray,
+    stages: Sequence[Stage],
+    until: float = np.inf,
+    project: Callable[[Stage, np.ndarray], np.ndarray] | None = None,
+) -> TaskResult:
     """The end of the stages in turn from x; all rays count as failed where a merit is not finite.
 
-    until: a time of `time.monotonic`, after which a task is not completed. Raises SearchStopped.
+    until: a time of `time.monotonic`, after which a task is not completed; project: changes the variables before each
+    stage. Raises SearchStopped.
     """
     started = time.process_time()
     for stage in stages:
-        x, end = np.clip(x, stage.lower, stage.upper), None
+        end = None
+        with np.errstate(all="ignore"):
+            x = np.clip(x if project is None else project(stage, x), stage.lower, stage.upper)
         with np.errstate(all="ignore"):
             if stage.problem.state(x, False).is_finite:
                 with suppress(np.linalg.LinAlgError, RuntimeError):  # numbers overflow
