@@ -54,7 +54,6 @@ DIFFERENT = {
     "--efl": "edit scales to a number, stock finds parts within a range",
     "--elements": "draw has sheets of some, stock finds parts of a number of them",
     "--glass": "one of a phase element, several of a part",
-    **dict.fromkeys(("--insert", "--delete"), "search tries elements, edit takes surfaces and rows"),
 }
 
 

@@ -319,7 +319,7 @@ def test_the_document_has_the_fixed_keys_and_the_lens_round_trips(command_line):
     document = done.document
     assert [*document] == [
         "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
-        "conditions",
+        "conditions", "between",
     ]  # fmt: skip
     assert [*document["variables"][0]] == ["name", "before", "after"]
     assert [*document["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]

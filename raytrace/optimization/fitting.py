@@ -139,7 +139,7 @@ class Fitted:
         ratio = f", {end / start:.4g} times" if start > 0 else ""
         cost = [later.reached - earlier.reached for earlier, later in zip(self.steps, self.steps[1:], strict=False)]
         head = [f"{self.source}: merit of the design {start:.8g} → {end:.8g}{ratio}"]
-        columns: Columns = {
+        columns: dict[Column, Any] = {
             Column("step", form="<"): [f"{step.kind} {step.surfaces} {step.name}".strip() for step in self.steps],
             Column("predicted"): [step.predicted if step.predicted == step.predicted else "" for step in self.steps],
             Column("merit"): [step.reached for step in self.steps],

@@ -12,7 +12,7 @@ from torch import Tensor
 from raytrace.maths.numerics import value
 from raytrace.maths.result import plain
 from raytrace.optimization.least_squares import Cycle, CycleStart, Descent, SumOfSquares
-from raytrace.optimization.lifted import Lifted
+from raytrace.optimization.lifted import Lifted, LiftedLoss
 from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import FunctionMerit, NoProblem, Problem, typical_of
 from raytrace.optimization.quantities import Quantity, of_configurations
@@ -222,6 +222,7 @@ class LossDescents:
         denser = self.loss.denser()
         if denser is None:
             return descent.state
+        assert isinstance(descent.state, LiftedLoss)
         loss = _finite_or_inf(FunctionMerit(self.problem.model, denser), descent.state.x)
         return dataclasses.replace(descent.state, loss=loss)
 

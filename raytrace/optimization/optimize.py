@@ -291,19 +291,23 @@ def optimize(
     fitted, descended, evaluations = None, 0, 0
     start = dict(zip(names, model.start, strict=True))
     if is_fitted and not opening.interrupted and descent.stopped != "interrupted":
-        design = Design(problem, lower, upper, descent.state)
+        at_minimum = Design(problem, lower, upper, descent.state)
         bar = progress(None, "trial") if progress else None
         settings: dict[str, Any] = {"cycles": cycles, "until": until, "bar": bar}
-        fit = StockFit(design, stock, **settings) if stock is not None else PlateFit(design, plates or (), **settings)
-        design = fit.run()
+        fit = (
+            StockFit(at_minimum, stock, **settings)
+            if stock is not None
+            else PlateFit(at_minimum, plates or (), **settings)
+        )
+        best_fit = fit.run()
         if bar is not None:
             bar.close()
-        problem, lower, upper, fitted = design.problem, design.lower, design.upper, fit.report(design)
-        descended, evaluations, fixed = fit.descended, fit.evaluations, fit.fixed(design)
+        problem, lower, upper, fitted = best_fit.problem, best_fit.lower, best_fit.upper, fit.report(best_fit)
+        descended, evaluations, fixed = fit.descended, fit.evaluations, fit.fixed(best_fit)
         data = optimization_data_of(problem.model, problem.rows, problem.unit, held)
         data = dataclasses.replace(data, variables=tuple(v for v in data.variables if v.address not in fixed))
         stopped = "interrupted" if fit.interrupted else descent.stopped
-        descent = dataclasses.replace(descent, state=design.state, stopped=stopped)
+        descent = dataclasses.replace(descent, state=best_fit.state, stopped=stopped)
     x, count = descent.state.x, len(problem.rows)
     after = problem.evaluated(x)
     return ended(

@@ -125,7 +125,7 @@ def _contacts(lens: Lens) -> list[int]:
         return []
     held = {path.path[1] for operand in lens.operands for path in operand.paths if path.path[-1] == _SIZE}
     automatic = {rule.surface for rule in data.kept if rule.is_largest_size}
-    return sorted((held & automatic).difference(data.semi_diameters))
+    return sorted(automatic.intersection(held).difference(data.semi_diameters))
 
 
 def with_contacts(lens: Lens) -> Lens:

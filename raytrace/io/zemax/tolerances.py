@@ -507,7 +507,8 @@ class _Writer:
         part = 1.0
         if row.kind == "abbe" and row.unit == "%":
             part = float(abbe_number(self.lens.surfaces[k].glass)) / 100
-        self.line(name, k, second, *(self.of_file(part * limit, power) for limit in (row.minimum, row.maximum)))
+        low, high = (self.of_file(part * limit, power) for limit in (row.minimum, row.maximum))
+        self.line(name, k, second, low, high)
 
     def _pivot(self, row: Tolerance) -> None:
         """MPVT, where a tilt has another pivot than the lines above."""
@@ -568,8 +569,8 @@ class _Writer:
         else:
             name, first = "CPAR", item.surface
             second, scale = self._place(item.surface, item.parameter, f"compensator {item}")
-        ends = [limit / scale for limit in limits]
-        self.line(name, first, second, *(ends if scale > 0 else ends[::-1]))
+        low, high = (limit / scale for limit in (limits if scale > 0 else limits[::-1]))
+        self.line(name, first, second, low, high)
 
 
 # -- lines of a lens that is edited ------------------------------------------------------------------------------------
