@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 import raytrace as rt
 from raytrace.plotting.style import new_figure, text_width
 from raytrace.settings import ON_REQUEST, SECTIONS
-from raytrace.workshop.document import Document, Heading, Picture, Section, rows_grid, settled
+from raytrace.workshop.document import Document, Grid, Heading, Picture, Section, rows_grid, settled
 from raytrace.workshop.pages import _FOOT, ROOM, TALL, _paginated, pdf
 from raytrace.workshop.report import KINDS_OF_SECTIONS, BadReport
 from raytrace.workshop.web import page
@@ -367,3 +367,9 @@ def test_a_reason_of_all_configurations_is_stated_once():
     (section,) = report.content.sections
     assert section.gap.count("all fields are on the axis") == 1
     assert section.gap.startswith("Distortion: nothing to show")
+
+
+def test_the_tolerances_of_a_report_are_complete():
+    report = rt.report("phone", only=["tolerances"], grade="precision")
+    (grid,) = (block for block in report.content.sections[0].blocks if isinstance(block, Grid))
+    assert len(grid.rows) == len(rt.tolerances(rt.read_lens("phone"), grade="precision")) > 100

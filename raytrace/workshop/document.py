@@ -80,15 +80,15 @@ def grid_of(columns: Columns, result: Result | None = None) -> Grid:
     return Grid(tuple(heads), tuple(zip(*rows, strict=True)), sides)
 
 
-def tables_of(result: Result) -> list[Block]:
-    """The tables of a result, with the lines above and below them."""
+def tables_of(result: Result, most: int = MOST_ROWS) -> list[Block]:
+    """The tables of a result, of so many rows at most, with the lines above and below them."""
     blocks: list[Block] = []
     for table in result.tables():
         blocks += [line.strip() for line in table.title if line.strip()]
         if table.columns:
             grid = grid_of(table.columns, result)
-            rest = len(grid.rows) - MOST_ROWS
-            blocks.append(dataclasses.replace(grid, rows=grid.rows[:MOST_ROWS]) if rest > 0 else grid)
+            rest = len(grid.rows) - most
+            blocks.append(dataclasses.replace(grid, rows=grid.rows[:most]) if rest > 0 else grid)
             blocks += [f"and {rest:,} more rows"] if rest > 0 else []
         blocks += [line.partition("; --json")[0].strip() for line in table.notes if line.strip()]
     return blocks

@@ -293,7 +293,7 @@ def _tolerances(request: _Request, writer: _Writer) -> None:
         raise BadReport(f"The lens stores no tolerances; {option('grade')} adds those of a published grade.")
     if grade:
         writer.blocks.append(f"Tolerances of the grade {grade}.")
-    writer.blocks += tables_of(table)
+    writer.blocks += tables_of(table, most=len(table))
     writer.documents.append(table.document())
 
 

@@ -8,6 +8,7 @@ import functools
 import io
 import itertools
 import math
+import re
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -292,7 +293,8 @@ def _element(drawings: Drawings, parts: Sequence[Part]) -> Paper:
     for k, line in enumerate(lines):
         paper.fitted(MARGIN + 2, _FOOT + 3 + 3.4 * (len(lines) - 1 - k), line, right - MARGIN - 4, 6)
     comment = lens.surfaces[parts[0].surfaces[0]].comment.strip()
-    words = f"{name}: {comment}" if comment and parts[0].surfaces[0] != lens.stop else name
+    is_name = re.search(r"[^\W\d_]{3}", comment) and parts[0].surfaces[0] != lens.stop  # not the radius of a patent
+    words = f"{name}: {comment}" if is_name else name
     _title_block(paper, drawings, words, scale, (_SPLIT, _FOOT))
     return paper
 
