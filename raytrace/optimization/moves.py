@@ -31,7 +31,7 @@ _MEETINGS = 4  # of conditions, by shortest steps
 @dataclass(frozen=True)
 class Move:
     """A step to a lens of other surfaces: its name, its search problem, and the descent to variables near its minimum,
-    a function of a time of `time.monotonic`."""
+    a function of the time when it ends, as of `descended`."""
 
     name: str
     task: SearchProblem
