@@ -100,9 +100,9 @@ class Moves:
             raise NoProblem(f"{option('moves')}: none; expected some of {', '.join(KINDS)}")
         if lens.operands:
             raise NoProblem(f"{option('moves')}: the lens has several configurations; take one of them")
-        for name, named in surfaces.items():
+        for name, chosen in surfaces.items():
             objection = no_cementing if name == "cement" else KINDS[name].objection
-            for k in named:
+            for k in chosen:
                 if why := objection(task, lens, k):
                     raise NoProblem(f"{option('moves', f'{name}:{k}')}: surface {k} {why}")
         if elements is None:
@@ -119,17 +119,19 @@ class Moves:
     def of_lens(self, task: SearchProblem, lens: Lens, changes: Sequence[int] = (1, 0, -1)) -> list[Move]:
         """The moves of a lens at its minimum that change its number of elements by some of these numbers."""
         each: list[Move] = []
-        for name, named in self.surfaces.items():
+        for name, chosen in self.surfaces.items():
             kind = KINDS[name]
             if kind.elements in changes:
                 every = range(1, sensor(lens) + 1)
-                each += kind.moves(task, lens, named or [k for k in every if not kind.objection(task, lens, k)])
+                each += kind.moves(task, lens, chosen or [k for k in every if not kind.objection(task, lens, k)])
         return each
 
     def about(self) -> dict:
         """Dependencies of the search, for its journal."""
         return {
-            "moves": [f"{name}:{','.join(map(str, named))}".removesuffix(":") for name, named in self.surfaces.items()],
+            "moves": [
+                f"{name}:{','.join(map(str, chosen))}".removesuffix(":") for name, chosen in self.surfaces.items()
+            ],
             "elements": None if self.elements is None else [*self.elements],
             **({} if self.elements is None else {"keep": self.keep}),
         }
@@ -185,9 +187,9 @@ class LensMoves:
             self._minima(task).each.append(minimum)
         now, (low, high) = counts(self.task.model.lens)[0], self.moves.elements
         numbers = [*range(now, high), *range(max(now, high), low - 1, -1)]
-        for at, number in enumerate(numbers):
-            rises = number < high and at < high - now
-            if number not in numbers[:at] and 0 in (KINDS[name].elements for name in self.moves.surfaces):
+        for place, number in enumerate(numbers):
+            rises = number < high and place < high - now
+            if number not in numbers[:place] and 0 in (KINDS[name].elements for name in self.moves.surfaces):
                 self._taken(self._kept(number, progress), (0,), progress, f"{number} elements")
             self.at_loss.pop(number, None)
             best = self._kept(number, progress)
@@ -223,19 +225,19 @@ class LensMoves:
 
     def _taken(self, lenses: Sequence[Found], changes: Sequence[int], progress: Callable | None, unit: str) -> int:
         """The moves of lenses, and the descents from the best ends; the number of moves."""
-        named: list[tuple[str, Move]] = []
+        steps: list[tuple[str, Move]] = []
         for task, minimum in lenses:
             at_minimum = started_at(task, minimum.result.x)
             for move in self.moves.of_lens(at_minimum, at_minimum.model.lens, changes):
-                named.append((f"{minimum.task} > {move.name}", move))
-        few = len(named) if self.moves.elements is None else _FOLLOWED * self.moves.keep
-        bar = None if progress is None or not named else progress(len(named) + min(few, len(named)), "descent")
+                steps.append((f"{minimum.task} > {move.name}", move))
+        few = len(steps) if self.moves.elements is None else _FOLLOWED * self.moves.keep
+        bar = None if progress is None or not steps else progress(len(steps) + min(few, len(steps)), "descent")
         try:
-            ends = self._each([(key, move, partial(self._near, move)) for key, move in named], bar, unit)
-            self.started += len(named)
+            ends = self._each([(key, move, partial(self._near, move)) for key, move in steps], bar, unit)
+            self.started += len(steps)
             tasks = [
                 (f"{key}, followed", move, partial(self._followed, move, end.x, LONG))
-                for key, move, end in self._selected(named, ends, few)
+                for key, move, end in self._selected(steps, ends, few)
             ]
             for (key, move, _), end in zip(tasks, self._each(tasks, bar, unit), strict=True):
                 self._minima(move.task).add(end, key.removesuffix(", followed"), self.work)
@@ -243,7 +245,7 @@ class LensMoves:
         finally:
             if bar is not None:
                 bar.close()
-        return len(named)
+        return len(steps)
 
     def _near(self, move: Move) -> TaskResult:
         """The lens of a move near its minimum."""
@@ -259,10 +261,10 @@ class LensMoves:
         return descended(x, [stage], self.journal.until)
 
     def _selected(
-        self, named: Sequence[tuple[str, Move]], ends: Sequence[TaskResult], few: int
+        self, steps: Sequence[tuple[str, Move]], ends: Sequence[TaskResult], few: int
     ) -> list[tuple[str, Move, TaskResult]]:
         """The best ends of moves, without those that are near the same minimum as a better one."""
-        pairs = [(key, move, end) for (key, move), end in zip(named, ends, strict=True) if np.isfinite(end.merit)]
+        pairs = [(key, move, end) for (key, move), end in zip(steps, ends, strict=True) if np.isfinite(end.merit)]
         pairs.sort(key=lambda pair: (pair[2].lost, pair[2].missed > _CLOSE, pair[2].merit))
         if self.moves.elements is None:
             return pairs

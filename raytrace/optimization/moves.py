@@ -31,7 +31,7 @@ _MEETINGS = 4  # of conditions, by shortest steps
 @dataclass(frozen=True)
 class Move:
     """A step to a lens of other surfaces: its name, its search problem, and the descent to variables near its minimum,
-    a function of a time of `time.monotonic`."""
+    a function of the time when it ends, as of `descended`."""
 
     name: str
     task: SearchProblem
@@ -136,9 +136,10 @@ def with_gaps(rows: Sequence[Row], numbering: Numbering, k: int, count: int) -> 
     return tuple(widened)
 
 
-def is_boundary(row: Row) -> bool:
-    """Whether a row limits the thickness of gaps from one to another."""
-    return row.operand in BOUNDARIES and row.operand[:2] in ("MN", "MX") and row.operand[-1] in "TGA"
+def is_boundary(row: Row, kinds: tuple[str, ...] = ("MN", "MX")) -> bool:
+    """Whether a row limits the thickness of gaps from one to another: the least, the largest, or either."""
+    name = row.operand
+    return isinstance(name, str) and name in BOUNDARIES and name.startswith(kinds) and name[-1] in "TGA"
 
 
 def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Row, ...]:
@@ -153,7 +154,7 @@ def thinned(rows: Sequence[Row], gaps: tuple[int, int], part: float) -> tuple[Ro
 def _split(row: Row, least: int, most: int, part: float) -> list[Row]:
     """A row of least thicknesses as several: of the other gaps, and with part of its target of those to be thin."""
     first, last = row.integers
-    if not (is_boundary(row) and row.operand.startswith("MN")) or last < least or first > most:
+    if not is_boundary(row, ("MN",)) or last < least or first > most:
         return [row]
     ranges = [(first, least - 1), (max(first, most + 1), last)]
     rows = [replace(row, integers=ends) for ends in ranges if ends[0] <= ends[1]]

@@ -30,6 +30,7 @@ from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Vary
 from raytrace.system.parameter_paths import sensor
+from raytrace.system.surface import vertex_curvature
 from raytrace.words import option
 
 _PARTS = 0.8, 0.6, 0.4, 0.2, 0.1, 0.0  # of the difference of the curvatures and of the thickness
@@ -64,8 +65,8 @@ def no_cementing(task: SearchProblem, lens: Lens, k: int, *, named: bool = True)
         return why
     if named or (length := task.space.focal_length) is None:
         return ""
-    faces = [float(lens.surfaces[face].curvature) for face in (k, k + 1)]
-    return "" if abs(faces[0] - faces[1]) * length <= _AGREE else "faces one of another curvature"
+    front, back = (float(vertex_curvature(lens.surfaces[face])) for face in (k, k + 1))
+    return "" if abs(front - back) * length <= _AGREE else "faces one of another curvature"
 
 
 def _no_closing(task: SearchProblem, lens: Lens, k: int, begins: str) -> str:

@@ -158,9 +158,9 @@ def _conditions(state: SumOfSquares, like: SumOfSquares | None = None) -> np.nda
 # -- the moves ---------------------------------------------------------------------------------------------------------
 
 _SIDES = {"one side": 1.0, "other side": -1.0}
-_PARTS = 0.5, 1.0  # of the least thicknesses, one after the other
+_PARTS = 0.25, 0.5, 0.75, 1.0  # of the least thicknesses, one after the other
 _OFF = np.geomspace(0.03, 10, 18)  # of the residuals: steps off the saddle that are tried
-_CYCLES = 8, 6  # without thickness, and with every part of it
+_CYCLES = 15, 10  # without thickness, and with every part of it
 _CAREFUL = SolverOptions(damping=0.1, bends=False)
 
 

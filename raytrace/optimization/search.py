@@ -136,7 +136,8 @@ class Searched(Result):
     @property
     def of_elements(self) -> dict[int, Lens]:
         """The best lens of every number of elements, of a search by moves."""
-        return {int(self.elements[k]): self.lenses[k] for k in reversed(self._best)} if self._best else {}
+        numbers = [] if self.elements is None else self.elements.tolist()
+        return {numbers[k]: self.lenses[k] for k in sorted(self._best, key=lambda k: numbers[k])}
 
     @property
     def _best(self) -> list[int]:
