@@ -280,7 +280,10 @@ def test_numbers_of_a_refresh_are_those_of_the_library(name):
     slow = compute.mtf_of_field(state, 1)["mtf"]
     both = compute.mtf_of_field(reduce(state, {"type": "compare", "on": True}), 1)
     of_stored = compute.mtf_of_field(dataclasses.replace(state, lens=state.stored), 1)["mtf"]
-    assert both["stored_mtf"] == of_stored  # compared with the stored lens by the same kind of MTF
+    assert both["stored_mtf"]["transfer"] == of_stored["transfer"]  # the same kind of MTF of both lenses
+    for section in ("tangential", "sagittal"):
+        compared, alone = (torch.tensor(each[section]) for each in (both["stored_mtf"], of_stored))
+        assert torch.allclose(compared, alone, atol=1e-5)  # 1 and 1 - 1e-16 are rounded to another digit
     assert both["mtf"] == slow
     assert "stored_mtf" not in compute.mtf_of_field(state, 1)
     exact = rt.mtf(lens, frequencies, fields=fields[:, 1:2])
