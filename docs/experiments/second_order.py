@@ -171,7 +171,9 @@ def lm(case: Case, x: np.ndarray) -> np.ndarray:
 def whole(case: Case, x: np.ndarray) -> np.ndarray:
     """With restarts and denser rays."""
     descents = LossDescents(case.problem, case.losses[0], (case.ends["lower"], case.ends["upper"]))
-    return descents.run(x, first=False, restarts=2, cycles=None, until=INF).x
+    end = descents.run(x, first=False, restarts=2, cycles=None, until=INF)
+    case.function.evaluations = end.evaluations
+    return end.x
 
 
 def units(case: Case, x: np.ndarray) -> np.ndarray:
@@ -284,12 +286,13 @@ def table() -> None:
                     continue
                 fail, gains = np.isnan(errors), 10 * np.log10(spots / errors)
                 seconds = np.median([float(row["seconds"]) for row in of_runs])
-                count = np.median([int(row["evaluations"]) for row in of_runs])
-                said = [f"rate {of_runs[0]['rate']}"] if optimizer == "adam" else []
+                counts = [int(row["evaluations"]) for row in of_runs if row["evaluations"] != "0"]
+                said = [f"{np.median(counts):.0f} evaluations"] if counts else []
+                said += [f"rate {of_runs[0]['rate']}"] if optimizer == "adam" else []
                 said += [f"{fail.sum()} fail by denser rays"] if fail.any() else []
                 print(
                     f"{name:20} from {start:6}{optimizer:9} {np.nanmean(gains):6.2f} dB ({np.nanmin(gains):6.2f} … "
-                    f"{np.nanmax(gains):5.2f}) {seconds:6.1f} s {count:5.0f} evaluations, {len(gains)} seeds "
+                    f"{np.nanmax(gains):5.2f}) {seconds:6.1f} s, {len(gains)} seeds "
                     f"{', '.join(said)}"
                 )
 
