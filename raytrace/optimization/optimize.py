@@ -45,7 +45,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.parameter_paths import OF_LENS
 from raytrace.tracing.compiled import prepare
-from raytrace.tracing.geometry import warn_of_defects, with_contacts
+from raytrace.tracing.geometry import warn_of_defects, with_contacts, with_semi_diameters
 from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level, option
 
@@ -220,7 +220,7 @@ def optimize(
         """The result at variables x (n,), with its warnings; more: further fields."""
         results = _attained(problem, after, x, lower=lower, upper=upper)
         seconds = time.monotonic() - started
-        end, model = lens_at(x).with_semi_diameters(), problem.model  # the automatic ones follow the rays
+        end, model = with_semi_diameters(lens_at(x)), problem.model  # the automatic ones follow the rays
         return _warned(_optimized(lens, end, model, x, history, conditions=results, seconds=seconds, **more))
 
     if conditions:
