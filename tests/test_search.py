@@ -779,7 +779,7 @@ MOVES = ["--merit", "spot", "--vary", "curvature sensor", "--hold", "efl=50", "-
         (["--merit", "spot", "--vary", "curvature", "--moves", "cement:1"], "no air space between two glasses"),
         (["--merit", "spot", "--vary", "curvature", "--elements", "2"], "--elements goes with --moves"),
         ([*MOVES, "insert", "--keep", "2"], "--keep goes with --elements"),
-        ([*MOVES, "insert:1", "--elements", "2"], "surfaces are those of the lens"),
+        ([*MOVES, "insert:1", "--elements", "2"], "surface numbers are of the given lens"),
         ([*MOVES, "insert", "--elements", "1:"], "expected numbers of elements from 1 on, as 4"),
         ([*MOVES, "cement", "--elements", "2"], "the lens has 1; more are made by --moves insert split"),
         ([*MOVES, "cement"], "no air space between two glasses whose facing curvatures"),

@@ -88,12 +88,12 @@ def summary(gaps: Sequence[Between]) -> list[str]:
     even = [f"{gap.ratio:.3g} {_EVEN[gap.samples]}" for gap in largest.values() if not gap.is_worse]
     return [
         *lines,
-        *([f"largest ratio of RMS spot radii to those of the merit function: {', '.join(even)}"] if even else []),
+        *([f"largest ratio of RMS spot radii to the spots of the merit function: {', '.join(even)}"] if even else []),
     ]
 
 
 def warn_of_worse(gaps: Sequence[Between]) -> None:
-    """Warn WorseBetween of those that are worse."""
+    """Warn WorseBetween of each gap that is worse."""
     for gap in (gap for gap in gaps if gap.is_worse):
         warnings.warn(str(gap), WorseBetween, stacklevel=calling_level())
 

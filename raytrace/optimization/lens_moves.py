@@ -111,7 +111,7 @@ class Moves:
             return cls(surfaces)
         if any(surfaces.values()):
             raise NoProblem(
-                f"{option('moves', joined(words))}: surfaces are those of the lens, which change on the way to "
+                f"{option('moves', joined(words))}: surface numbers are of the given lens, and change on the way to "
                 f"{option('elements', elements)}; leave one of both out"
             )
         return cls(surfaces, _range_of(elements, lens, surfaces), KEEP if keep is None else keep)
@@ -249,11 +249,11 @@ class LensMoves:
 
     def _near(self, move: Move) -> TaskResult:
         """The lens of a move near its minimum."""
-        begun = move.taken(self.journal.until)
-        if not np.isfinite(begun.merit):
-            return begun
-        end = self._followed(move, begun.x, _NEAR)
-        return end._replace(seconds=begun.seconds + end.seconds)
+        near = move.taken(self.journal.until)
+        if not np.isfinite(near.merit):
+            return near
+        end = self._followed(move, near.x, _NEAR)
+        return end._replace(seconds=near.seconds + end.seconds)
 
     def _followed(self, move: Move, x: np.ndarray, cycles: int) -> TaskResult:
         space = move.task.space

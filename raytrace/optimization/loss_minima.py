@@ -80,14 +80,14 @@ class ByLoss:
                 bar.close()
 
     def _minimised(self, task: SearchProblem, x: np.ndarray) -> TaskResult:
-        begun = time.process_time()
+        started = time.process_time()
         descents = LossDescents(task.whole, self.loss, (task.space.lower, task.space.upper))
         try:
             end = descents.run(x, first=False, restarts=0, cycles=LONG, until=self.journal.until)
         except (NoProblem, EmptyPsf):  # rays of the loss fail
-            return TaskResult(np.inf, np.inf, np.inf, time.process_time() - begun, x)
+            return TaskResult(np.inf, np.inf, np.inf, time.process_time() - started, x)
         if end.stopped in ("interrupted", "seconds"):
             raise SearchStopped
         missed = float(task.whole.state(end.x, False).missed.max(initial=0.0))
         value = end.report.end if np.isnan(end.report.checked) else end.report.checked
-        return TaskResult(0.0, missed, value, time.process_time() - begun, end.x)
+        return TaskResult(0.0, missed, value, time.process_time() - started, end.x)

@@ -165,10 +165,10 @@ class Searched(Result):
 
     def tables(self) -> list[Table]:
         count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
-        begun = f"{self.starts} starts" if self.elements is None else f"{self.starts} moves"
+        source = f"{self.starts} starts" if self.elements is None else f"{self.starts} moves"
         title = [
             self.before.name,
-            f"  {count} from {begun} in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            f"  {count} from {source} in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
             f"  found: by how many of the {self.descents} descents that were followed to their end",
             "  between: the largest ratio of an RMS spot between fields, wavelengths or rays to those beside it",
             *([f"  in the order of the merit as built: {self.tolerances}"] if self.as_built is not None else []),
