@@ -49,20 +49,21 @@ def test_the_second_start_has_axial_colour_and_the_focal_length(name):
 
 
 @pytest.mark.slow
-def test_descents_of_both_filters_have_equal_budgets():
-    """A few evaluations, on the axis and at one distance, behind filters apart and joint: the error falls in both."""
+def test_descents_of_both_filters_lower_the_error():
+    """A few cycles, on the axis and at one distance, behind filters apart and joint, from both starts."""
     spectrum = colours.synthetic(rt.imaging.power_law(colours._PERIOD).expand(3, 3, -1, -1), 0.97)
     ends = []
     for filters in ("apart", "joint"):
         end = colours.optimised(
-            "cooke_triplet", "axis", "24 m", lambda k, f=filters: colours.closed_form(k, spectrum, f).mean(), 8
+            "cooke_triplet", "axis", "24 m", lambda k, f=filters: colours.closed_form(k, spectrum, f).mean(), 4
         )
         lens = colours.lens_of("cooke_triplet")
         kernel = colours.kernels(lens, colours.field_points(lens, "axis"), "24 m")
         torch.testing.assert_close(kernel.sum((-2, -1)), torch.ones(1, 1, 3, dtype=torch.float64))
-        assert end["value"] < 1e3 * float(colours.closed_form(kernel, spectrum, filters).mean())
+        before = 1e3 * float(colours.closed_form(kernel, spectrum, filters).mean())
+        assert end["value"] == min(value for value, _ in end["starts"].values()) < 0.9 * before
+        assert colours.axial_colour(colours.rebuilt("cooke_triplet", end["numbers"])) == end["axial_colour"]
         ends.append(end)
-    assert ends[0]["evaluations"] == ends[1]["evaluations"] == 4
     assert ends[1]["value"] < ends[0]["value"]
 
 

@@ -2,8 +2,8 @@
 
     python docs/experiments/codesign_colours.py cooke_triplet double_gauss --data DIR -o FOLDER --docs docs
 
-Air spaces, model glasses and the sensor of a lens are optimised for the mean square error in closed form, behind the
-best filter of each channel or behind the best joint filter, with equal numbers of evaluations. Both lenses are judged
+Air spaces, model glasses and the sensor of a lens are optimised by steps of second order for the mean square error in
+closed form, behind the best filter of each channel or behind the best joint filter. Both lenses are judged
 with DRT PSFs, behind both filters, on pictures that neither has seen. Every seed has its own split of the pictures and
 its own noise; differences are paired by seed. A second call resumes, and computes what is missing.
 """
@@ -11,7 +11,6 @@ its own noise; differences are paired by seed. A second call resumes, and comput
 import argparse
 import functools
 import itertools
-import math
 import time
 import warnings
 from collections.abc import Callable
@@ -20,12 +19,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from codesign_as_built import interval, save
-from scipy.optimize import minimize
 from torch import Tensor
 
 import raytrace as rt
 from raytrace.files import write_json
 from raytrace.imaging.image import add_noise, blur, linearised, transfer_functions
+from raytrace.imaging.lens_steps import LensSteps
 from raytrace.imaging.pictures import Pictures, crop, digest, files, read, split
 from raytrace.imaging.restoration import (
     cross_spectrum,
@@ -73,7 +72,6 @@ _DEPTHS, _TESTED = 4, 5  # of an optimisation and of its test
 _SIZE, _PERIOD = 41, 64  # pixels of a kernel and of the period of closed forms
 _PATCH, _FILTER, _MARGIN = 96, 128, 8  # pixels of a recorded patch, of the filter of its extension, and left out
 _CROPS, _TESTS = 4, 4  # of every picture of training and of test
-_FIRST = 0.05  # length of the first step of a descent, in units of the variables
 _COLOUR = 0.4  # mm between the foci of blue and red of the second start
 _INDEX, _ABBE, _ABBES = 0.05, 15.0, (20.0, 85.0)  # changes of model glasses, and bounds
 _GAUSSIAN, _DRT = 6, 2  # orders
@@ -191,46 +189,23 @@ def closed_form(kernels: Tensor, spectrum: Tensor, filters: str) -> Tensor:
     return kernel_error(kernels, spectrum.real.diagonal().movedim(-1, 0), NOISE)
 
 
-def optimised(name: str, fields: str, scene: str, loss: Callable[[Tensor], Tensor], evaluations: int) -> dict:
-    """Descend from the lens of the file and from one with axial colour, with half of the evaluations each."""
+def optimised(name: str, fields: str, scene: str, loss: Callable[[Tensor], Tensor], cycles: int) -> dict:
+    """The lower end of two descents of second order: from the lens of the file, and from one with axial colour."""
     ends = []
     for start in ("file", "colour"):
         lens = lens_of(name)
         points, variables = field_points(lens, fields), variables_of(name, lens)
         if start == "colour":
             with_colour(name, variables)
-        parameters, course = list(variables.parameters()), []
-        bounds = []
-        for variable in variables.variables:
-            low, high = variables.bounds.get(variable.name, (-math.inf, math.inf))
-            bounds.append(
-                ((low - variable.start) / variable.unit / _FIRST, (high - variable.start) / variable.unit / _FIRST)
-            )
 
-        def evaluate(x: np.ndarray, variables=variables, points=points, parameters=parameters, course=course):
-            with torch.no_grad():
-                for parameter, number in zip(parameters, x, strict=True):
-                    parameter.fill_(_FIRST * float(number))
-            value = 1e3 * loss(kernels(variables(), points, scene)) + variables.violation()
-            slope = torch.autograd.grad(value, parameters)
-            value, slope = float(value.detach()), np.array([float(part) for part in slope])
-            if not (math.isfinite(value) and np.isfinite(slope).all()):
-                value, slope = 1e3, np.zeros(len(x))
-            course.append((value, x.copy()))
-            return value, _FIRST * slope
+        def error(variables: rt.Variables = variables, points: Tensor = points) -> Tensor:
+            return 1e3 * loss(kernels(variables(), points, scene))
 
-        first = np.array([float(parameter.detach()) for parameter in parameters]) / _FIRST
-        budget = evaluations // 2
-        minimize(evaluate, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": budget, "ftol": 1e-12})
-        value, x = min(course[:budget], key=lambda entry: entry[0])
-        with torch.no_grad():
-            for parameter, number in zip(parameters, x, strict=True):
-                parameter.fill_(_FIRST * float(number))
-        ends.append(
-            {"start": start, "value": value, "evaluations": len(course[:budget]), "numbers": variables.numbers()}
-        )
+        values = LensSteps(variables).minimise(error, cycles=cycles).values
+        numbers = {"value": values[-1], "evaluations": len(values), "numbers": variables.numbers()}
+        ends.append({"start": start, **numbers, "axial_colour": axial_colour(variables())})
     best = min(ends, key=lambda end: end["value"])
-    return {**best, "other_start": {end["start"]: end["value"] for end in ends}}
+    return {**best, "starts": {end["start"]: (end["value"], end["axial_colour"]) for end in ends}}
 
 
 def rebuilt(name: str, numbers: dict[str, float]) -> Lens:
@@ -270,7 +245,7 @@ def restored(lens: Lens, fields: str, scene: str, spectrum: Tensor, unseen: Tens
 
 
 def run(
-    name: str, fields: str, scene: str, criterion: str, seed: int, pictures: Pictures, folder: Path, evaluations: int
+    name: str, fields: str, scene: str, criterion: str, seed: int, pictures: Pictures, folder: Path, cycles: int
 ) -> dict:
     """A lens optimised and tested, or its stored results. criterion: "apart", "joint", or a correlation."""
     path = folder / f"{name}_{fields}_{scene.replace(' ', '_')}_{criterion}_{seed}.json"
@@ -282,7 +257,7 @@ def run(
     controlled = criterion not in ("apart", "joint")
     spectrum = synthetic(measured, float(criterion)) if controlled else measured
     filters = criterion if criterion == "apart" else "joint"
-    end = optimised(name, fields, scene, lambda kernel: closed_form(kernel, spectrum, filters).mean(), evaluations)
+    end = optimised(name, fields, scene, lambda kernel: closed_form(kernel, spectrum, filters).mean(), cycles)
     lens = rebuilt(name, end["numbers"])
     document = {**end, "axial_colour": axial_colour(lens), "seconds": time.perf_counter() - start}
     if controlled:
@@ -456,7 +431,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--evaluations", type=int, default=40, help="of an optimisation, half of them from each start")
+    parser.add_argument("--cycles", type=int, default=60, help="of a descent, at most")
     parser.add_argument("--groups", type=int, default=len(RUNS), help="the first groups of runs alone")
 
 
@@ -479,7 +454,7 @@ def main(words: list[str] | None = None) -> None:
         for name, seed in itertools.product(chosen.lenses, range(1 if criteria == CORRELATIONS else chosen.seeds)):
             for criterion in criteria:
                 found[name, fields, scene, criterion, seed] = run(
-                    name, fields, scene, criterion, seed, pictures, chosen.folder, chosen.evaluations
+                    name, fields, scene, criterion, seed, pictures, chosen.folder, chosen.cycles
                 )
         print(table(comparisons(found, chosen.lenses)), flush=True)
     rows = comparisons(found, chosen.lenses)
