@@ -67,23 +67,24 @@ class CodesignSettings(Settings):
     response and random places on it; its pixels, shot noise (full_well), read noise (of a full well in electrons, else
     `noise`), mosaic and bits are those of `imaging.sensor`, and the pictures are linear in light.
     model: PSF model of step 1; vary, bounds, hold: variables, their bounds and constraints, as texts; no_hold: without
-    the conditions of the lens; step: unit of the
-    variables, "sag" or "blur"; optimizer: of the lens, "lm", steps of second order to the optimum of the closed form,
-    behind which the network is trained, or "adam", together with the network; turns: of the lens, by steps of second
-    order for the loss of a network that adapts to it, and of the network again, as many epochs; relearn: epochs of step
-    1 again with the nearest glasses of the catalogs, in place of model glasses that vary; glasses: a selection of them,
-    as text (`rt.glasses`); filters: of the closed form,
-    "separate" or "joint", of colours; glass_thickness, air_thickness, edge: limits; start: of the sensor, for an object
-    at focus_distance; near, far, spread: range and distribution of object distances; fields: points in y, one after the
-    other for successive samples; pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its
-    layers, or poolings, and maps; rays, drt_rays, sampling: fixed pupil points instead of `tol`.
+    the conditions of the lens; step: unit of the variables, "sag" or "blur"; optimizer: of the lens, "lm", steps of
+    second order to the optimum of the closed form, behind which the network is trained, or "adam", together with the
+    network; turns: of the lens, by steps of second order for the loss of a network that adapts to it, and of the
+    network again, as many epochs; relearn: epochs of step 1 again with the nearest glasses of the catalogs, in place of
+    model glasses that vary; glasses: a selection of them, as text (`rt.glasses`); filters: of the closed form,
+    "separate" or "joint", of colours; filter_each_field: with filters for each field, by default one for all;
+    glass_thickness, air_thickness, edge: limits; start: of the sensor, for an object at focus_distance; near, far,
+    spread: range and distribution of object distances; fields: points in y, one after the other for successive samples;
+    pixel, size: window of the PSF; network: "red-net" or "u-net"; depth, width: its layers, or poolings, and maps;
+    rays, drt_rays, sampling: fixed pupil points instead of `tol`.
     as_built: training draws a perturbed lens for each sample; grade, limits: its tolerances, by default those of the
     file; refocus: "sensor", or "none"; cameras: perturbed ones of the test; center: of the PSF window, "" for the
     centroid of the light with tolerances and the chief ray without.
-    A stored run without one of the fields has its default (`recorded`), one without `optimizer` is of Adam.
+    A stored run without one of the fields has its default (`recorded`), one without `optimizer` is of Adam, and one
+    without `filter_each_field` has filters for each field.
     """
 
-    UNRECORDED: ClassVar[Mapping[str, object]] = {"optimizer": "adam"}
+    UNRECORDED: ClassVar[Mapping[str, object]] = {"optimizer": "adam", "filter_each_field": True}
 
     model: str = "gaussian"
     vary: str = "sensor"
@@ -99,6 +100,7 @@ class CodesignSettings(Settings):
     relearn: int = 0
     glasses: str = ""
     filters: str = "separate"
+    filter_each_field: bool = False
     start: str = "paraxial"
     focus_distance: float = 25e3
     f_number: float | None = None

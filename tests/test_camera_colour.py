@@ -364,7 +364,7 @@ def test_optics_and_network_have_rates_of_their_own(triplet):
 
 
 def test_the_closed_form_is_over_fields_colours_and_distances(triplet, pictures):
-    """The mean over fields and channels of the errors of single ones, with its derivative."""
+    """The mean over channels of errors behind one filter for all fields, or for each field, with its derivative."""
     one = initial_camera(triplet, SETTINGS)
     spectrum = patch_spectrum(pictures[0], 26, crops=1)
     assert spectrum.shape == (3, 26, 26)
@@ -386,7 +386,15 @@ def test_the_closed_form_is_over_fields_colours_and_distances(triplet, pictures)
         for n in range(kernels.shape[1])
         for c in range(3)
     ]
-    assert float(error) == pytest.approx(sum(single) / len(single), rel=1e-9)
+    with torch.no_grad():
+        of_each_field = float(camera_error(one, spectrum, distances, filter_each_field=True))
+    assert of_each_field == pytest.approx(sum(single) / len(single), rel=1e-9)
+    of_all = [
+        float(depth_invariant_error(transfer_functions(kernels[:, :, c].flatten(0, 1), 26), spectrum[c], 0.02))
+        for c in range(3)
+    ]
+    assert float(error.detach()) == pytest.approx(sum(of_all) / 3, rel=1e-9)
+    assert of_each_field < 0.99 * float(error.detach())
 
 
 @pytest.mark.slow

@@ -82,6 +82,9 @@ ROWS = {
         "colours (joint)",
         choices=("separate", "joint"),
     ),
+    "filter_each_field": option(
+        "closed form with filters for each field (default: one for all, as a network that does not know the field)"
+    ),
     "glass_thickness": option(
         "centre thickness of elements: minimum, or minimum and maximum (default 1/50 of the largest diameter)",
         "MIN[:MAX]",

@@ -1,4 +1,5 @@
-"""A camera's error in closed form, by the best depth-invariant linear filter: deterministic, no network, no noise."""
+"""A camera's error in closed form, by the best linear filter that knows neither object distance nor field, as a network
+does not: deterministic, no network, no noise."""
 
 import copy
 import dataclasses
@@ -58,14 +59,21 @@ def patch_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int =
 
 
 def camera_error(
-    camera: Camera, spectrum: Tensor, distances: Tensor | Sequence[float], *, draw: torch.Generator | None = None
+    camera: Camera,
+    spectrum: Tensor,
+    distances: Tensor | Sequence[float],
+    *,
+    filter_each_field: bool = False,
+    draw: torch.Generator | None = None,
 ) -> Tensor:
-    """Mean square error behind the best depth-invariant filter, over object distances (Z,) mm and the camera's fields.
+    """Mean square error behind the best filter that knows neither the field nor the object distance, over the camera's
+    fields and distances (Z,) mm.
 
     spectrum: `patch_spectrum` of the camera's pictures. Differentiable in the variables of the camera. The mean over
-    the channels of the sensor and the camera's fields, each with a filter of its own; with cross spectra (C, C, rows,
-    columns) the filter of each field is joint, `joint_wiener`. draw: of an element alone, generator of errors of
-    fabrication. Round elements whose sampling is fixed (`Camera.plan`) need an eighth of the frequencies (`octant`).
+    the channels of the sensor, each with a filter of its own; with cross spectra (C, C, rows, columns) the filter is
+    joint, `joint_wiener`. filter_each_field: with filters for each field, which restore more than a network that does
+    not know the field can. draw: of an element alone, generator of errors of fabrication. Round elements whose sampling
+    is fixed (`Camera.plan`) need an eighth of the frequencies (`octant`).
     """
     _refuse_aliases(camera)
     spectrum = spectrum.to(camera.fields.device)
@@ -79,6 +87,8 @@ def camera_error(
         kernels = of_elements.paired(camera.fields)[:, None]
     else:
         kernels = camera.kernels_over_field(distances, draw=draw)
+    if not filter_each_field:
+        kernels = kernels.flatten(0, 1)[:, None]
     if spectrum.dim() == 4:
         return joint_kernel_error(kernels, spectrum, sigma, haze=haze).mean()
     return kernel_error(kernels, spectrum.to(kernels.dtype), sigma, haze=haze).mean()
@@ -140,18 +150,20 @@ def optimise_closed_form(
     distances: Tensor | None = None,
     steps: int | None = None,
     optimizer: Literal["lbfgs", "lm"] = "lbfgs",
+    filter_each_field: bool = False,
 ) -> Course:
     """Minimise `camera_error` plus the penalty for violated limits, within the bounds: the local optimum downhill.
 
     optimizer: "lbfgs", L-BFGS-B of scipy in the units of the variables, or "lm", steps of second order in the metric of
     the blur, under the conditions of the variables (`lens_steps`). steps: at most so many, by default until it has
-    settled.
+    settled. filter_each_field: as of `camera_error`.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, parts = camera.variables, []
 
     def loss() -> Tensor:
-        error, penalty = camera_error(camera, spectrum, distances), variables.violation()
+        error = camera_error(camera, spectrum, distances, filter_each_field=filter_each_field)
+        penalty = variables.violation()
         parts.append((float(error.detach()), float(penalty.detach())))
         return error + penalty
 
@@ -200,6 +212,7 @@ def least_of_closed_form(
     *,
     distances: Tensor | None = None,
     optimizer: Literal["lbfgs", "lm"] = "lbfgs",
+    filter_each_field: bool = False,
 ) -> tuple[Course, float]:
     """Minimise `camera_error` by descents from several lenses; returns the best one, at which the lens of the camera
     is, and the sensor distance reached by the first.
@@ -207,13 +220,16 @@ def least_of_closed_form(
     The first starts at the camera's lens. With "lm" the next starts at the sharpest spots. The last starts at the
     minimum of a scan of sensor distances, evenly over those at which an object of the range is in focus, if the sensor
     varies and the scan promises less than the others reached: DRT and Gaussian DRT have several optima.
+    filter_each_field: as of `camera_error`.
     """
     distances = even_distances(camera) if distances is None else distances
     variables, ends = camera.variables, []
     start = copy.deepcopy(variables.state_dict())
 
     def descend() -> None:
-        course = optimise_closed_form(camera, spectrum, distances=distances, optimizer=optimizer)
+        course = optimise_closed_form(
+            camera, spectrum, distances=distances, optimizer=optimizer, filter_each_field=filter_each_field
+        )
         ends.append((course, copy.deepcopy(variables.state_dict())))
         variables.load_state_dict(start)
 
@@ -227,7 +243,9 @@ def least_of_closed_form(
         low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
         count = _SCANNED[camera.model]
         sensors = [low + (high - low) * (number + 0.5) / count for number in range(count)]
-        errors = scan(camera, spectrum, sensors, distances) if high > low else [math.inf]
+        errors = [math.inf]
+        if high > low:
+            errors = scan(camera, spectrum, sensors, distances, filter_each_field=filter_each_field)
         if min(errors) < min(course.errors[-1] for course, _ in ends) * (1 - _BETTER):
             _move_sensor(camera, sensors[errors.index(min(errors))])
             descend()
@@ -239,12 +257,19 @@ def least_of_closed_form(
 
 
 @torch.no_grad()
-def scan(camera: Camera[Variables], spectrum: Tensor, sensors: Sequence[float], distances: Tensor) -> list[float]:
-    """Closed-form error at each sensor distance in mm; the sensor is a variable, and is put back."""
+def scan(
+    camera: Camera[Variables],
+    spectrum: Tensor,
+    sensors: Sequence[float],
+    distances: Tensor,
+    *,
+    filter_each_field: bool = False,
+) -> list[float]:
+    """`camera_error` at each sensor distance in mm; the sensor is a variable, and is put back."""
     before, errors = copy.deepcopy(camera.variables.state_dict()), []
     for sensor in sensors:
         _move_sensor(camera, sensor)
-        errors.append(float(camera_error(camera, spectrum, distances)))
+        errors.append(float(camera_error(camera, spectrum, distances, filter_each_field=filter_each_field)))
     camera.variables.load_state_dict(before)
     return errors
 

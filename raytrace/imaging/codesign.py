@@ -750,7 +750,10 @@ def to_closed_form(trained: Camera[Variables], settings: CodesignSettings, spect
     alike = dataclasses.replace(settings, model=model)
     first = initial_camera(trained.variables.lens, alike, catalogs=trained.variables.catalog)
     distances = even_distances(first, spread=settings.spread)
-    course, _ = least_of_closed_form(first, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer])
+    course, _ = least_of_closed_form(
+        first, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer],
+        filter_each_field=settings.filter_each_field,
+    )  # fmt: skip
     trained.variables.load_state_dict(first.variables.state_dict())
     return course
 
@@ -765,15 +768,15 @@ def closed_form(
     optimised = initial_camera(lens, settings, catalogs=catalogs)
     if settings.start == GAUSSIAN:
         to_closed_form(optimised, settings, spectrum)
-    distances = even_distances(optimised, spread=settings.spread)
+    distances, each = even_distances(optimised, spread=settings.spread), settings.filter_each_field
     course, downhill = least_of_closed_form(
-        optimised, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer]
+        optimised, spectrum, distances=distances, optimizer=_DESCENTS[settings.optimizer], filter_each_field=each
     )
     with torch.no_grad():
         lens = optimised.variables()
-        error = camera_error(optimised, spectrum, distances)
+        error = camera_error(optimised, spectrum, distances, filter_each_field=each)
         freeze_lens(optimised, settings)
-        error_drt = camera_error(optimised, spectrum, distances)
+        error_drt = camera_error(optimised, spectrum, distances, filter_each_field=each)
     return Optimum(
         model=settings.model,
         **focus_columns(lens),
