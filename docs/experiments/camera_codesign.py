@@ -82,7 +82,7 @@ SEEDS = range(5)
 SHOWN = 9e3  # mm, object distance of the pictures
 TESTED = 7  # distances of the test, even in their reciprocal
 DISTANCES = 5  # of the closed form
-CYCLES = 8  # of the closed form
+CYCLES = 16  # of the closed form
 ARMS = {
     "models": ("gaussian", "drt", "frozen"),
     "apart": ("file", "spot", "spot, together", "closed form", "closed form, together", "together"),
