@@ -50,7 +50,7 @@ def test_a_little_study_is_trained_tested_and_resumed(tmp_path, monkeypatch):
         assert found["steps"] >= 2
     stored = next(tmp_path.glob("cooke_triplet/*/0/row.json"))
     before = stored.stat().st_mtime_ns
-    assert study.row_of(one, "cooke_triplet", "spot", 0) == rows[0]
+    assert study.row_of(one, "cooke_triplet", study.ARMS["apart"][0], 0) == rows[0]
     assert stored.stat().st_mtime_ns == before
     figure = study.draw(one, rows, "together")
     assert len(figure.axes) == 3

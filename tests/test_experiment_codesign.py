@@ -377,6 +377,8 @@ def test_blur_of_an_almost_paraxial_lens_is_that_of_similar_triangles(lens):
 @pytest.mark.slow
 def test_time_of_a_step_leaves_the_cameras_as_they_were(lens, pictures):
     cameras = [initial_camera(lens, dataclasses.replace(SMALL, model=model)) for model in ("paraxial", "drt")]
+    for own in cameras:
+        own.plan()
     before = [{key: value.clone() for key, value in own.state_dict().items()} for own in cameras]
     found = step_times(cameras, make_batch(pictures, SMALL, [0, 1, 2, 3], 0), repeats=2)
     assert [one.model for one in found] == ["paraxial", "drt"]

@@ -329,7 +329,8 @@ def psf(
         centre = base.centre[:, chosen] if base.centre.dim() > 1 and base.centre.shape[1] > 1 else base.centre
         part = lens if lenses in (None, len(chosen)) else one_lens(lens, chosen)
         drive = _driver(part, name, parameters, tol or 0.01, execution)
-        places = fields if fields.dim() == 2 else fields[:, chosen]
+        with torch.enable_grad():  # fields that vary break symmetry, without derivatives too
+            places = fields if fields.dim() == 2 else fields[:, chosen]
         batch = scene(part, places, distances[chosen], wavelengths, execution.memo)
         origin = None  # of the grids on the sensor, (2, D, F) mm, with its derivatives; None for the axis
         if center == "axis" or symmetry(batch) == "round":
