@@ -53,4 +53,4 @@ def test_a_little_study_is_trained_tested_and_resumed(tmp_path, monkeypatch):
     assert study.row_of(one, "cooke_triplet", study.ARMS["apart"][0], 0) == rows[0]
     assert stored.stat().st_mtime_ns == before
     figure = study.draw(one, rows, "together")
-    assert len(figure.axes) == 3
+    assert len(figure.axes) == len(study.ARMS["apart"]) - 1
