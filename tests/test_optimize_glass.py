@@ -145,10 +145,10 @@ def test_predicted_merits_rank_the_optimised_merits(triplet):
     design = DescendedDesign(start.state.x, own, start.state)
     for surface in choice.surfaces:
         merits = choice.predicted(design, [surface], ())[surface]
-        some = np.argsort(merits)[:60:5]
+        some = np.argsort(merits)[::5]
         glasses = [choice.candidates[surface][0][i] for i in some]
         reached = [choice.descend(Design(design.x, own | {surface: g}), (), 15).merit for g in glasses]
-        assert spearmanr(merits[some], reached)[0] > 0.6
+        assert spearmanr(merits[some], reached)[0] > 0.85
 
 
 # -- the lens ----------------------------------------------------------------------------------------------------------
