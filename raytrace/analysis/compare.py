@@ -41,7 +41,7 @@ from raytrace.analysis.thermal import thermal
 from raytrace.analysis.wavefronts import WavefrontMap, diverging, draw_map, wavefront
 from raytrace.io import as_lens
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Column, Result, Table, flat
+from raytrace.maths.result import Column, Result, Table, flat, rounding
 from raytrace.plotting.style import (
     GREY,
     Axes,
@@ -186,6 +186,22 @@ class LensComparison(Result):
             "second": self.second.document(),
             **Result.document(self),
         }
+
+    def roundings(self) -> dict[str, Tensor]:
+        """Those of the analysis, and of the differences by the larger of the values of both lenses: of all rows, or of
+        each one where rows are quantities."""
+        first, second = self._of_both(brief=self._is_brief)
+        known, limits = self.first.roundings(), {}
+        for name in (name for name in first if name not in (*_HEADS, *_NO_VALUES)):
+            pair = first[name], second[name]
+            if "quantity" in first:
+                limits[f"{name}_change"] = torch.stack([rounding(*row) for row in zip(*pair, strict=True)])
+                continue
+            limits[f"{name}_change"] = rounding(*pair)
+            if name in known:
+                limits |= {f"{name}_1": known[name], f"{name}_2": known[name]}
+                limits[f"{name}_change"] = torch.maximum(limits[f"{name}_change"], known[name])
+        return limits
 
     def tables(self) -> list[Table]:
         title = [f"{self.analysis.replace('_', ' ')}: A {self.names[0]}, B {self.names[1]}"]
