@@ -472,6 +472,19 @@ def _name(lens: Lens, condition: Condition, k: int) -> str:
     return f"{operand}({','.join(numbers)})" if numbers else operand
 
 
+def named_row(lens: Lens, rows: Sequence[Row], k: int, unit: float) -> Condition | None:
+    """Row k, from 1, as a condition with a name, whatever its weight, the primary wavelength as the default; unit: of
+    rows, mm. None for unknown operands."""
+    if rows[k - 1].operand not in OPERANDS:
+        return None
+    condition = _of_row(rows, k, unit)
+    row, takes = condition.row, OPERANDS[condition.row.operand].takes
+    if takes[1] == "wavelength" and row.integers[1] == lens.primary_wavelength and not condition.before:
+        row = dataclasses.replace(row, integers=(row.integers[0], 0))
+        condition = dataclasses.replace(condition, row=row)
+    return dataclasses.replace(condition, name=_name(lens, condition, k))
+
+
 def without_rows(rows: Sequence[Row], gone: Iterable[int]) -> tuple[Row, ...]:
     """Rows without some, from 1, and without those above whose values these alone take; rows that others need stay."""
     gone = set(gone)
