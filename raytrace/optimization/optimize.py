@@ -21,7 +21,7 @@ from raytrace.optimization.conditions import Condition, conditions_in_unit, spec
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.fitting import Design
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
-from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths
+from raytrace.optimization.least_squares import Cycle, NoOptimum, PathProgress, best_of_paths
 from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit
 from raytrace.optimization.opening import Opened, opened
@@ -271,10 +271,13 @@ def optimize(
             cycles=0 if opening.interrupted else cycles, seconds=None if seconds is None else until - time.monotonic(),
             watch=seen.after_cycle_of_paths, resume=resumed.descent,
         )  # fmt: skip
-        for _ in range(_CONTACTS):
+        for turn in range(_CONTACTS + 1):
             design = lens_at(descent.state.x)
             moved = with_contacts(design)
             if moved is design or opening.interrupted or descent.stopped == "interrupted":
+                break
+            if turn == _CONTACTS:
+                _warn_of_contacts(design, moved)
                 break
             problem = Problem(
                 dataclasses.replace(problem.model, lens=moved), rows.rows, conditions, as_built=term, **of_rows
@@ -321,6 +324,21 @@ def optimize(
         stopped="interrupted" if opening.interrupted else descent.stopped,
         glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing,
         as_built=None if term is None else AsBuiltChange.of(term, lens, lens_at(x)), fitted=fitted,
+    )  # fmt: skip
+
+
+def _warn_of_contacts(design: Lens, moved: Lens) -> None:
+    """Warn NoOptimum with the semi-diameters in contact that a lens had in its last descent, and should have had."""
+    sizes = [
+        (k, float(before.semi_diameter), float(after.semi_diameter))
+        for k, (before, after) in enumerate(zip(design.surfaces, moved.surfaces, strict=True))
+        if before.semi_diameter and after.semi_diameter
+    ]
+    changes = ", ".join(f"surface {k} by {after - before:+.3g} mm" for k, before, after in sizes if after != before)
+    warnings.warn(
+        f"the semi-diameters at which spacers have contact still change after {_CONTACTS} more descents, with the "
+        f"last one: {changes}; the merit is that of the contacts before this change: optimise the lens again",
+        NoOptimum, stacklevel=calling_level(),
     )  # fmt: skip
 
 
