@@ -44,7 +44,7 @@ def tools() -> str:
     """A section for each tool of the server of agents, with its parameters."""
     parts = ["# Tools of agents\n\nParameters of the tools that `raytrace mcp` serves.\n"]
     for tool in TOOLS.values():
-        schema = tool.schema()
+        schema = tool.schema(in_full=True)
         parts.append(f"## `{tool.name}`\n\n{tool.description}\n\n| parameter | type | meaning |\n|---|---|---|")
         for name, parameter in schema["properties"].items():
             needed = " (required)" if name in schema["required"] else ""

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 import raytrace as rt
-from raytrace.agents.tools import TOOLS, BadParameter
+from raytrace.agents.server import documents
+from raytrace.agents.tools import TOOLS, BadParameter, instructions
 from raytrace.agents.worker import answer
 from raytrace.cli import main
 
@@ -54,6 +55,21 @@ def test_schemas_have_units_choices_and_limits():
     assert properties["sampling"]["enum"] == ["gauss", "hexapolar", "square", "sobol", "random"]
     assert TOOLS["convert"].schema()["required"] == ["source", "target"]
     assert "`target`" in TOOLS["convert"].description
+
+
+def test_shared_parameters_have_short_texts_whose_full_ones_are_given_once():
+    """An agent pays for the list of tools in every conversation."""
+    size = len(json.dumps(documents(), ensure_ascii=False, separators=(",", ":")).encode())
+    assert size + len(instructions().encode()) < 66_000
+    texts = [TOOLS[name].schema()["properties"]["substitute"]["description"] for name in ("spot", "optimize", "psf")]
+    assert len({*texts}) == 1
+    assert len(texts[0]) < 60
+    full = TOOLS["spot"].schema(in_full=True)["properties"]
+    for name in ("substitute", "fields", "ray_aiming", "f_number"):
+        assert f"- {name}: {full[name]['description']}" in instructions().splitlines()
+    assert "unless `sensor_distance` is given" in instructions()
+    seed = TOOLS["spot"].schema()["properties"]["seed"]
+    assert seed["default"] == 0
 
 
 def test_values_are_read_as_those_of_the_command_line():

@@ -544,6 +544,29 @@ def test_apertures_of_a_lens_that_a_sequence_cannot_hold_are_refused():
         again(far)
 
 
+def test_a_lens_at_the_temperature_of_its_catalogs_is_written():
+    """20 °C and 1 atm, of the lens and of surfaces, lose nothing where the catalogs are of 20 °C, too."""
+    lens = read_lens("double_gauss")
+    warm = lens.at(temperature=20, pressure=1)
+    local = warm.replace(2, environment=warm.environment)
+    assert leaves(again(warm)) == leaves(again(lens))
+    assert leaves(again(local)) == leaves(again(lens))
+    lengths = [float(rt.first_order(each).effective_focal_length) for each in (again(warm), warm)]
+    assert lengths[0] == pytest.approx(lengths[1], rel=1e-14)
+    for other in (lens.at(pressure=0), local.replace(2, environment=warm.at(temperature=25).environment)):
+        with pytest.raises(LensFileError, match="a temperature or pressure other than 20 °C and 1 atm"):
+            again(other)
+
+
+def test_a_glass_of_a_catalog_of_another_temperature_is_refused_with_its_surface():
+    lens = rt.lens([dict(radius=50, thickness=4, glass="S-LAH60MQ"), dict(radius=-50, thickness=48)], stop=1,
+        entrance_pupil_diameter=10)  # fmt: skip
+    again(lens)
+    with pytest.raises(LensFileError, match="S-LAH60MQ at 20 °C, whose catalog is of 25 °C") as caught:
+        again(lens.at(temperature=20))
+    assert caught.value.surface == 1
+
+
 def test_a_file_cut_off_anywhere_is_no_shorter_lens():
     text = FORMATS[".seq"].write(read_lens("cooke_triplet"), "lens.seq").decode()
     lens = of(text)[0]

@@ -159,6 +159,15 @@ def test_sums_of_seidel_aberrations_are_compared(lenses):
     assert len(comparison.plot().axes[0].patches) == 2 * 7
 
 
+def test_over_temperature_the_mount_and_the_frequency_of_the_mtf_are_stated(lenses):
+    comparison = rt.compare(*lenses, "thermal", fields=[0.0])
+    cycles = f"{float(comparison.first.frequency):.4g} cycles/mm"
+    assert f"mount: aluminium, 23.6e-6/K, of spaces that state no expansion; MTF at {cycles}" in str(comparison)
+    figure = comparison.plot()
+    assert [panel.get_ylabel() for panel in figure.axes][-1] == f"lowest modulation at\n{cycles}, sensor fixed"
+    assert figure.get_suptitle() == "over temperature, mount: aluminium, 23.6e-6/K"
+
+
 def test_lenses_that_cannot_be_compared_are_refused(lenses):
     with pytest.raises(Incomparable, match=r"`analysis=mtff`: no such analysis; did you mean mtf\?"):
         rt.compare(*lenses, "mtff")

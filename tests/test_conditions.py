@@ -238,6 +238,25 @@ def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(tripl
     assert free.merit_after < again.merit_after
 
 
+def test_conditions_of_the_argument_alone(triplet):
+    """`stored=False` leaves those of the lens, in a descent and a search as in the variables of a camera."""
+    lens = triplet.with_conditions("efl=100 edge>=9")  # elements of 3 to 4 mm
+    settings = {"merit": SPOT, "vary": "curvature:1-3 sensor", "hold": "total_track<=115", "stored": False}
+    alone = rt.optimize(lens, cycles=4, **settings)
+    assert [condition.name for condition in alone.conditions] == ["total_track"]
+    assert in_words(alone.lens) == "efl=100 edge>=9 total_track<=115"
+    same = rt.optimize(triplet, cycles=4, merit=SPOT, vary="curvature:1-3 sensor", hold="total_track<=115")
+    assert alone.merit_after == same.merit_after
+    with pytest.warns(ReplacedCondition, match="efl=95 replaces efl=100"):
+        replaced = rt.optimize(lens, cycles=4, **settings | {"hold": "efl=95"})
+    assert in_words(replaced.lens) == "edge>=9 efl=95"
+    found = rt.search(lens, starts=4, **settings)
+    assert in_words(found.lens) == in_words(alone.lens)
+    assert rt.Variables(lens, "curvature:1-3", hold="total_track<=115", stored=False).conditions == (
+        "total_track<=115",
+    )
+
+
 def test_an_argument_replaces_the_condition_of_the_lens_with_a_warning(triplet):
     lens = triplet.with_conditions("efl=100 edge>=1")
     with pytest.warns(ReplacedCondition, match="efl=95 replaces efl=100, a condition of the lens"):
@@ -259,6 +278,11 @@ def test_commands_honour_and_report_conditions(triplet, tmp_path, capsys):
     assert efl(better) == pytest.approx(100, rel=1e-8)
     assert main([*line, "--no-hold", "-o", str(tmp_path / "free.zmx")]) == 0
     assert abs(efl(rt.read_lens(tmp_path / "free.zmx")) - 100) > 1e-3
+    assert main([*line, "--no-hold", "--hold", "f_number=5.3", "-o", str(tmp_path / "other.zmx")]) == 0
+    other = rt.read_lens(tmp_path / "other.zmx")
+    assert abs(efl(other) - 100) > 1
+    assert float(rt.first_order(other).f_number) == pytest.approx(5.3, rel=1e-6)
+    assert in_words(other) == "efl=100 edge>=1 off:bfd>=80 f_number=5.3"
     capsys.readouterr()
     for command in ("info", "check", "evaluate"):
         assert main([command, path]) == 0

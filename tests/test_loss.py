@@ -161,11 +161,30 @@ def test_the_end_of_least_loss_by_denser_rays_counts(judged, monkeypatch):
     values = iter(judged)
     monkeypatch.setattr("raytrace.optimization.loss._ROUNDS", 0)  # no descent with denser rays
     monkeypatch.setattr(
-        LossDescents, "_judged", lambda self, descent: dataclasses.replace(descent.state, loss=next(values))
+        LossDescents,
+        "_judged",
+        lambda self, descent, function: (dataclasses.replace(descent.state, loss=(loss := next(values))), loss),
     )
     ended = rt.optimize(TRIPLET, loss=low_contrast, of=TRANSFER, **{**FEW, "restarts": 1}).loss
     assert len(set(ended.ends)) == 2
     assert ended.end == ended.ends[int(np.argmin(judged))]
+
+
+@pytest.mark.parametrize(("quantity", "restarts"), [(Otf(rings=1), 0), (TRANSFER, 2)])
+def test_every_evaluation_is_made_once_and_counted(quantity, restarts):
+    """By the rays of the descent and by denser ones, with which the first descent of few rays is continued."""
+    calls, cycles = [], []
+
+    def counted(otf):
+        calls.append(float(otf.abs().sum().detach()))
+        return low_contrast(otf)
+
+    options = {**FEW, "restarts": restarts, "cycles": 6, "watch": lambda cycle, lens: cycles.append(cycle.evaluations)}
+    result = rt.optimize(TRIPLET, loss=counted, of=quantity, **options)
+    assert len(calls) == len({*calls}) == result.evaluations
+    assert cycles == sorted(cycles)
+    assert 0 < cycles[-1] <= result.evaluations
+    assert np.isfinite(result.loss.checked)
 
 
 def test_an_interrupt_within_a_descent_is_followed_by_no_other(monkeypatch):

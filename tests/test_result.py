@@ -199,6 +199,48 @@ def test_x_of_fields_is_printed_where_it_is_not_0_under_the_names_of_the_frame()
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_rounding_errors_are_printed_as_0_and_returned_as_they_are():
+    """A ball with the stop at its centre has no coma; a stop 1e-7 mm beside the centre of a mirror has its own."""
+    half = dict(thickness=10.3, glass="N-BK7")
+    ball = rt.lens([dict(radius=10.3, **half), half, dict(radius=-10.3, thickness=5)], stop=2,
+        entrance_pupil_diameter=4, fields=[0, 13.3], wavelengths=[0.55, 0.48, 0.65])  # fmt: skip
+    sums = rt.seidel(ball)
+    coma, chief = float(sums.contributions[1].abs().max()), float(sums.chief_yni.abs().max())
+    assert 0 < coma < 1e-17
+    assert 0 < chief < 1e-15
+    assert "e-" not in str(sums)
+    assert max(abs(row["chief_yni"]) for row in sums.document()["results"]) == chief
+    mirror = [dict(thickness=198.7 + 1e-7), dict(radius=-198.7, thickness=-99.35, glass="MIRROR")]
+    sums = rt.seidel(rt.lens(mirror, stop=1, entrance_pupil_diameter=40, fields=[0, 3.3]))
+    assert f"{float(sums.contributions[1].sum()):.6g}" in str(sums)
+    triplet = rt.read_lens("cooke_triplet")
+    noise = dataclasses.replace(
+        rt.distortion(triplet), f_tan=1e-17 * torch.ones(11, 3), height=torch.full((11, 3), -3e-17)
+    )
+    printed = [line.split()[2:4] for line in str(noise).splitlines()[2:]]
+    assert printed == [["0", "0"]] * 33
+    single = dataclasses.replace(noise, f_tan=torch.full((11, 3), 1e-7), ideal=noise.ideal.float())
+    assert {line.split()[3] for line in str(single).splitlines()[2:]} == {"0"}  # 1e-5 %, in single precision
+
+
+def test_differences_below_the_rounding_of_their_terms_are_printed_as_0():
+    lens = rt.read_lens("double_gauss")
+    frequencies = torch.linspace(0, 100, 7).double()
+    both = rt.compare(lens, lens, "mtf", frequencies=frequencies)
+    other = dataclasses.replace(both.second, **{
+        name: getattr(both.second, name) + 4e-16 for name in ("tangential", "sagittal")})  # fmt: skip
+    noise = dataclasses.replace(both, second=other)
+    assert "e-1" not in str(noise)
+    assert 0 < noise.to_frame()["tangential_change"].abs().max() < 1e-15
+    larger = dataclasses.replace(
+        both, second=dataclasses.replace(both.second, tangential=both.second.tangential + 1e-12)
+    )
+    assert "e-12" in str(larger)
+    layouts = rt.compare(lens, rt.edit.scale(lens, 1 + 1e-15))
+    assert 0 < layouts.to_frame()["value_change"].abs().max() < 1e-11
+    assert "e-" not in str(layouts)
+
+
 def test_values_and_batches_print_large_tensors_by_shape_and_range():
     lens = rt.read_lens("double_gauss")
     batch = rt.system.batch([lens.replace(1, radius=60.0 + k) for k in range(50)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import warnings
 
 import numpy as np
@@ -230,3 +231,17 @@ def test_automatic_semi_diameters_follow_the_rays_of_an_athermal_lens(tmp_path):
     assert [s.semi_diameter for s in again.surfaces[1:5]] == [s.semi_diameter for s in after.surfaces[1:5]]
     stale = again.replace(1, curvature=1.05 * again.surfaces[1].curvature)
     assert stale.with_semi_diameters().surfaces[3].semi_diameter != stale.surfaces[3].semi_diameter
+
+
+def test_contacts_that_still_move_are_a_warning(monkeypatch):
+    """With the surfaces and the last change: the difference between the contacts of the descent and of the result."""
+    monkeypatch.setattr("raytrace.optimization.optimize._CONTACTS", 1)
+    lens = air_spaced().with_semi_diameters(fixed=[4], margin=(0, 0.5))
+    start = lens.with_temperatures([-20, 60], mount="aluminium")
+    settings = {"vary": "curvature sensor thickness:2", "bounds": "thickness:2..10", "merit": "spot", "cycles": 3}
+    with pytest.warns(rt.NoOptimum, match="still change after 1 more descents") as caught:
+        after = rt.optimize(start, **settings).lens
+    (words,) = (str(warning.message) for warning in caught if warning.category is rt.NoOptimum)
+    changes = dict(re.findall(r"surface (\d) by ([+-][\de.-]+) mm", words))
+    assert {*changes} <= {"1", "2", "3"}
+    assert all(abs(float(change)) > 1e-6 * after.surfaces[int(k)].semi_diameter for k, change in changes.items())

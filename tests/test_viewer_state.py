@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import threading
 import time
 
@@ -512,11 +513,26 @@ def test_an_optimisation_keeps_what_the_file_requires(triplet, weight, tmp_path)
     session = Session(rt.read_lens(tmp_path / "held.zmx"))
     session.answer({"type": "merit", "kind": "wavefront"})
     first = session.answer({"type": "optimise"})["optimisation"]
-    assert "with EFFL wavelength 2 = 100 of the file" in first["words"]
+    assert "with efl=100 of the file" in first["words"]
     last = progress(session, ended=True)
-    assert "with EFFL wavelength 2 = 100 of the file" in last["optimisation"]["words"]
+    assert "with efl=100 of the file" in last["optimisation"]["words"]
     length = float(rt.first_order(session.state.lens).effective_focal_length)
     assert length == pytest.approx(100, rel=1e-6 if weight < 0 else 1e-2)
+
+
+def test_boundaries_and_missed_conditions_have_the_names_of_conditions(triplet):
+    """Of rows of the merit function too, on the panel and in the message."""
+    boundaries = rt.Merit.default(triplet, rings=2, edge=9.0, air_thickness=(0.1, 99.0))
+    data = OptimizationData((Vary(1, "curvature"),), merit=boundaries.rows)
+    session = Session(dataclasses.replace(triplet, optimization_data=data))
+    shown = [one["words"] for one in session.answer({"type": "open"})["prescription"]["conditions"]]
+    assert {words.rsplit(" (row", 1)[0] for words in shown} == {
+        *("edge >= 9", "air_thickness >= 0.1", "air_thickness <= 99", "air_edge >= 0.1"),
+    }
+    session.answer({"type": "optimise"})
+    last = progress(session, ended=True)["optimisation"]["words"]
+    assert re.search(r"edge >= 9 \(row \d+\) is not reached: \d", last)
+    assert not re.search("M[NX][EC][GAT]", last.partition("near this lens")[0])  # reasons name rows
 
 
 def test_a_file_of_conditions_alone_is_optimised_for_its_spots(triplet):

@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from raytrace.agents.tools import INSTRUCTIONS, TOOLS, BadParameter, tool_of
+from raytrace.agents.tools import TOOLS, BadParameter, instructions, tool_of
 from raytrace.cli import version
 from raytrace.cli.progress import silence
 from raytrace.words import RaytraceError, missing_extra
@@ -156,7 +156,7 @@ def server(folder: Path) -> "Server":
     return Server(
         "raytrace",
         version=version(),
-        instructions=INSTRUCTIONS,
+        instructions=instructions(),
         lifespan=workers,
         on_list_tools=tools,
         on_call_tool=call,
@@ -172,7 +172,7 @@ def documents() -> list[dict]:
             "inputSchema": tool.schema(),
             "annotations": {
                 "readOnlyHint": not tool.writes,
-                "destructiveHint": tool.writes,
+                **({"destructiveHint": True} if tool.writes else {}),
                 "openWorldHint": False,
             },
         }
@@ -183,7 +183,7 @@ def documents() -> list[dict]:
 def carry_out(arguments: argparse.Namespace) -> int:
     """Serve standard input and output until they are closed, or print the tools."""
     if arguments.json:
-        print(json.dumps({"tools": documents()}, indent=2, ensure_ascii=False))
+        print(json.dumps({"instructions": instructions(), "tools": documents()}, indent=2, ensure_ascii=False))
         return 0
     silence()
     served = server(Path(arguments.folder))

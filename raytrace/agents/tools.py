@@ -17,13 +17,30 @@ from raytrace.cli.options import OPTIONS, add
 from raytrace.cli.types import OutputFile, OutputFolder
 from raytrace.words import RaytraceError, did_you_mean, known_option
 
-#: Given to the agent at the start.
-INSTRUCTIONS = (
+#: Given to the agent at the start, with the full texts of the parameters of `_BRIEF`.
+_ABOUT = (
     "A sequential, differentiable ray tracer for lens design. Lenses are named by the name of a shipped lens (the tool "
     "lenses lists them) or by the path of a lens file relative to the folder of this server. Lengths are mm, "
     "wavelengths µm, angles degrees, unless stated otherwise; surfaces count from 1. The parameter json gives all "
-    "figures in full precision, plot the picture."
+    "figures in full precision, plot the picture. Switches are false by default. Parameters of several tools, in full:"
 )
+
+#: Texts of parameters that many tools have, in their schemas: an agent reads every schema in every conversation.
+_BRIEF = {
+    "configuration": "of a multi-configuration file, from 1",
+    "catalog": "glass catalog to search first",
+    "substitute": "another glass for one of the file, as SSK4=SSK4A",
+    "json": "return a JSON document",
+    "max_bytes": "memory limit, as 4GB",
+    "magnification": "of the paraxial image: sets the object distance",
+    "sensor_distance": "from the last vertex to the image",
+    "f_number": "image-space F/#",
+    "wavelengths": "the first is primary",
+    "ray_aiming": "aim rays at the stop",
+    "temperature": "of the lens and the air",
+    "mount": "material of spacers without an expansion, as aluminium",
+    "fields": "field points, y or [x, y], in the lens's kind of field",
+}
 
 
 @dataclass(frozen=True)
@@ -80,20 +97,25 @@ class Tool:
                 text = re.sub(rf"\b{action.metavar}\b", f"`{action.dest}`", text)
         return self.in_parameters(text)
 
-    def schema(self) -> dict:
-        """The JSON schema of the parameters."""
-        properties = {name: self._parameter(action) for name, action in self.actions.items()}
+    def schema(self, *, in_full: bool = False) -> dict:
+        """The JSON schema of the parameters; in_full: with the full texts of those of `_BRIEF`."""
+        properties = {name: self._parameter(action, in_full) for name, action in self.actions.items()}
         if self.writes:
-            properties["overwrite"] = {"type": "boolean", "default": False, "description": "replace files that exist, "
-                "or resume from them"}  # fmt: skip
+            properties["overwrite"] = {"type": "boolean", "description": "replace files that exist, or resume"}
         required = [name for name, action in self.actions.items() if _is_required(action)]
         return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
-    def _parameter(self, action: argparse.Action) -> dict:
-        text = self._said((action.help or "").replace("%%", "%"))
+    def _parameter(self, action: argparse.Action, in_full: bool = False) -> dict:
+        help_text = (action.help or "").replace("%%", "%")
+        is_brief = not in_full and action.dest in _BRIEF and help_text == OPTIONS[action.dest].help
+        text = _BRIEF[action.dest] if is_brief else self._said(help_text)
         if action.dest == "plot":
             about = text.removeprefix("save ").partition(" as .png")[0]
-            return {"type": "boolean", "default": self.pictured, "description": f"return a picture of {about}"}
+            return {
+                "type": "boolean",
+                **({"default": True} if self.pictured else {}),
+                "description": f"return a picture of {about}",
+            }
         unit = _UNITS.get(action.metavar if isinstance(action.metavar, str) else "")
         schema = dict({"type": "boolean"} if _is_switch(action) else _SCHEMAS.get(action.type, {"type": "string"}))
         if action.choices is not None:
@@ -102,7 +124,7 @@ class Tool:
             schema = {"type": "array", "items": schema}
             if isinstance(action.nargs, int):
                 schema |= {"minItems": action.nargs, "maxItems": action.nargs}
-        if isinstance(action.default, (bool, int, float, str)) and action.default != "":
+        if isinstance(action.default, (bool, int, float, str)) and action.default != "" and action.default is not False:
             schema["default"] = action.default
         negated = "false: " if isinstance(action, argparse._StoreFalseAction) else ""
         return schema | {"description": f"{negated}{text}{f'; unit: {unit}' if unit else ''}"}
@@ -163,6 +185,12 @@ TOOLS = {
         Tool("stock_find"),
     )
 }
+
+
+def instructions() -> str:
+    """What an agent is told at the start: the conventions, and the full texts of shared parameters."""
+    spot = TOOLS["spot"]
+    return "\n".join([_ABOUT, *(f"- {name}: {spot.in_parameters(OPTIONS[name].help)}" for name in _BRIEF)])
 
 
 def tool_of(name: str) -> Tool:

@@ -19,7 +19,7 @@ from raytrace.analysis.setting import (
 )
 from raytrace.analysis.spot_diagram import airy_radius
 from raytrace.maths.numerics import Number, divide, dot_2, safe_divide, safe_sqrt, value
-from raytrace.maths.result import Column, masked
+from raytrace.maths.result import Column, masked, rounding
 from raytrace.plotting.style import FAINT, Figure, new_figure, styled
 from raytrace.system.lens import Lens
 from raytrace.tracing.launch import is_at_infinity
@@ -62,6 +62,10 @@ class Distortion(OverField):
         percent = {name: 100 * curve for name, curve in relative.items() if curve is not None}
         shown = {name: masked(curve, self.valid) for name, curve in {"height": self.height, **percent}.items()}
         return {**self.heads(wavelength=self.wavelengths), **shown}
+
+    def roundings(self) -> dict[str, Tensor]:
+        percent = rounding(self.f_tan.new_tensor(100.0))  # of quotients of 100 %, less 100 %
+        return {"height": rounding(self.ideal), "f_tan_percent": percent, "f_theta_percent": percent}
 
     def at(self, fields: Tensor) -> "Distortion":
         return distortion_of(self.lens, fields)

@@ -37,11 +37,12 @@ from raytrace.analysis.spot_diagram import (
     spot,
     wavelength_handles,
 )
-from raytrace.analysis.thermal import thermal
+from raytrace.analysis.thermal import Thermal, thermal
 from raytrace.analysis.wavefronts import WavefrontMap, diverging, draw_map, wavefront
 from raytrace.io import as_lens
+from raytrace.materials.mounts import mount_words
 from raytrace.maths.numerics import detached, value
-from raytrace.maths.result import Column, Result, Table, flat
+from raytrace.maths.result import Column, Result, Table, flat, rounding
 from raytrace.plotting.style import (
     GREY,
     Axes,
@@ -187,10 +188,27 @@ class LensComparison(Result):
             **Result.document(self),
         }
 
+    def roundings(self) -> dict[str, Tensor]:
+        """Those of the analysis, and of the differences by the larger of the values of both lenses: of all rows, or of
+        each one where rows are quantities."""
+        first, second = self._of_both(brief=self._is_brief)
+        known, limits = self.first.roundings(), {}
+        for name in (name for name in first if name not in (*_HEADS, *_NO_VALUES)):
+            pair = first[name], second[name]
+            if "quantity" in first:
+                limits[f"{name}_change"] = torch.stack([rounding(*row) for row in zip(*pair, strict=True)])
+                continue
+            limits[f"{name}_change"] = rounding(*pair)
+            if name in known:
+                limits |= {f"{name}_1": known[name], f"{name}_2": known[name]}
+                limits[f"{name}_change"] = torch.maximum(limits[f"{name}_change"], known[name])
+        return limits
+
     def tables(self) -> list[Table]:
         title = [f"{self.analysis.replace('_', ' ')}: A {self.names[0]}, B {self.names[1]}"]
         if not torch.equal(self.lens.wavelengths, self.other.wavelengths):
             title.append("wavelengths of both: those of A")
+        title += [self.first.scene()] if isinstance(self.first, Thermal) else []
         columns = _differences(*self._of_both(brief=self._is_brief))
         every = getattr(self.first, "EVERY", 1)
         tables = [Table(columns, title)]
@@ -435,7 +453,9 @@ def _finished(
         figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     titles = {"rms_over_field": "RMS over the field", "mtf": "MTF", "opd_fan": "OPD fans", "ray_fan": "ray fans"}
     titles |= {"seidel": "sums of the Seidel aberrations", "distortion_grid": "grid distortion"}
-    titles |= {"thermal": "over temperature", "incidence": "angles of incidence on the sensor"}
+    if isinstance(pair.first, Thermal):
+        titles["thermal"] = f"over temperature, mount: {mount_words(float(pair.first.expansion))}"
+    titles |= {"incidence": "angles of incidence on the sensor"}
     figure.suptitle(titles.get(pair.analysis, pair.analysis.replace("_", " ")), fontweight="bold", fontsize=10)
     return figure
 

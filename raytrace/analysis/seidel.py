@@ -21,7 +21,7 @@ from raytrace.analysis.panels import field_axis, finished
 from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.numerics import Number, value
-from raytrace.maths.result import Column, Table, cell
+from raytrace.maths.result import Column, Table, cell, rounding
 from raytrace.plotting.style import FAINT, GREY, INK, Figure, array, field_colour, new_figure, styled
 from raytrace.system.lens import Lens, field_label, field_points, media
 from raytrace.system.surface import Surface, is_even, vertex_curvature
@@ -34,6 +34,11 @@ _SEIDEL = {
     "S1": "spherical", "S2": "coma", "S3": "astigmatism", "S4": "Petzval", "S5": "distortion", "C1": "axial colour",
     "C2": "lateral colour", "W040": "spherical", "W131": "coma", "W222": "astigmatism", "W220P": "Petzval",
     "W311": "distortion", "W020": "axial colour", "W111": "lateral colour",
+}  # fmt: skip
+#: Powers of the field by names, after their first letter for sums, transverse and longitudinal aberrations.
+_POWERS = {
+    **{"1": 0, "2": 1, "3": 2, "4": 2, "5": 3}, **{"SPH": 0, "SCO": 1, "TCO": 1, "AST": 2, "PFC": 2, "SFC": 2},
+    **{"TFC": 2, "DIS": 3, "AXC": 0, "LAC": 1, "040": 0, "131": 1, "222": 2, "220P": 2, "311": 3, "020": 0, "111": 1},
 }  # fmt: skip
 _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
 
@@ -87,6 +92,21 @@ class Seidel(Analysis):
         """A row for every field: the lens's aberrations, sums over the surfaces, and its invariant."""
         total = self.contributions.sum(-1)
         return {**self.heads(), **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
+
+    def roundings(self) -> dict[str, Tensor]:
+        """Those of the sums over the surfaces, and of Ā y = H + A ȳ, which may cancel: S2 = S1 Ā/A has the size of
+        S1 H/(A y)."""
+        yni, H = self.marginal_yni, self.invariant[:, None]
+        ratio = torch.where(yni.abs() > rounding(yni), H / yni, 0.0)
+        by_power = torch.ones_like(ratio), ratio, ratio**2, ratio**2 * (H / yni.abs().max())
+        sizes = dict(zip(self.names, self.contributions, strict=True))
+        colour = next(name for name in self.names if name in _COLOURS)
+        limits = {}
+        for name, size in sizes.items():
+            on_axis = sizes[colour if name in _COLOURS else self.names[0]]
+            limits[name] = rounding(size, on_axis * by_power[_POWERS[name[1:]]])
+        chief = rounding(self.chief_yni, self.chief_height * H / self.marginal_height.abs().max())
+        return {**limits, "marginal_yni": rounding(yni), "chief_yni": chief}
 
     def tables(self) -> list[Table]:
         """A table for each field: a row for each surface, and their sums, of which y n i has none."""

@@ -85,11 +85,15 @@ class Thermal(Analysis):
             "depth_of_focus_um": 1e3 * float(self.depth_of_focus),
         }
 
-    def tables(self) -> list[Table]:
+    def scene(self) -> str:
+        """The mount and the frequency of the MTF."""
         words = [f"mount: {mount_words(float(self.expansion))}, of spaces that state no expansion"]
         words += [] if self.frequency is None else [f"MTF at {self.frequency:.4g} cycles/mm"]
-        words.append(f"a focus shift of ±{1e3 * float(self.depth_of_focus):.3g} µm is λ/4 of wavefront")
-        return [Table(self.columns(), ["; ".join(words)])]
+        return "; ".join(words)
+
+    def tables(self) -> list[Table]:
+        depth = f"a focus shift of ±{1e3 * float(self.depth_of_focus):.3g} µm is λ/4 of wavefront"
+        return [Table(self.columns(), [f"{self.scene()}; {depth}"])]
 
     @styled
     def draw(self) -> Figure:

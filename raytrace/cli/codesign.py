@@ -52,11 +52,11 @@ ROWS = {
     "hold": option(
         "efl (the file's focal length) or efl=100: the last variable with power is solved for it; further conditions "
         "of optimize, as total_track<=120, and buildable, thicknesses within their limits: exact after every step; in "
-        "addition to the conditions of the lens",
+        "addition to the conditions of the lens unless --no-hold is given",
         "NAME=VALUE",
         nargs="+",
     ),
-    "no_hold": option("without the conditions of the lens (default: with them)"),
+    "no_hold": option("without the conditions of the lens (default: with them); with --hold: those alone"),
     "step": option(
         "unit of the variables, of which --rate-optics is a part in mm: sag at the edge (default), or blur, the RMS "
         "spread of the rays of all fields: the same for every number of any lens",

@@ -258,14 +258,12 @@ FREEDOM = group(
     "vary",
     Option("bounds", None, "NAME:LOW..HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1..0), "
            "open on one side (sensor:30..)", nargs="+"),
-    exclusive(
-        Option("hold", help="without the conditions of the lens (default: with them)", flag="--no-hold",
-               action="store_false"),
-        Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens (default): efl=50 f_number=4 "
-               "'total_track<=80' 'distortion<=2%' 'bfd>=30' "
-               "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' 'edge>=1' efl@2=100, or an operand as "
-               "REAY(8,0,0,1,0,0)=2; off:efl=50 switches one off", nargs="+"),
-    ),
+    Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens (default) unless --no-hold is "
+           "given: efl=50 f_number=4 'total_track<=80' 'distortion<=2%' 'bfd>=30' "
+           "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' 'edge>=1' efl@2=100, or an operand as "
+           "REAY(8,0,0,1,0,0)=2; off:efl=50 switches one off", nargs="+"),
+    switch("stored", "without the conditions of the lens (default: with them), which keeps them; with --hold: those "
+           "alone", flag="--no-hold", default=True),
     about="Variables, in quotes: 'curvature thickness' (all powered surfaces, all gaps), curvature:1-4,7 conic:3 a4:3 "
     "tilt:5 decentre:5 sensor index glass:2, thickness:6@2 (in configuration 2); pickups and solves: "
     "'curvature:4=-curvature:3' 'thickness:8=2*thickness:2+1' 'curvature:7=f_number(4)' "

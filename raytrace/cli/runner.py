@@ -129,8 +129,6 @@ def options_of(arguments: argparse.Namespace) -> dict:
         and not name.startswith(_FIGURE)
         and (name not in RUNNER_OPTIONS or _takes(arguments, name))
     }
-    if options.get("hold") is False:
-        options["hold"] = None
     if _takes(arguments, "progress"):
         options["progress"] = partial(progress, what=arguments.command)
     if _takes(arguments, "share"):

@@ -1,5 +1,6 @@
 """Results of public functions: numbers, a table, a text, a document for JSON and a figure."""
 
+import functools
 import html
 import json
 import math
@@ -63,6 +64,9 @@ COLUMNS = {
 }  # fmt: skip
 SUFFIXES = {"_percent": "%", "_um": "µm"}
 
+#: Rounding of a sum or difference, in units of that of its largest term.
+_ROUNDING = 64
+
 #: Rows of a table in a notebook.
 MOST_ROWS = 100
 
@@ -92,6 +96,10 @@ class Result:
 
     def words(self) -> dict[str, Sequence[str]]:
         """Texts of columns whose numbers are places in these texts, from 0, by the name of the column."""
+        return {}
+
+    def roundings(self) -> dict[str, Tensor]:
+        """Rounding of columns of sums and differences by name, () or one a row; a text has smaller numbers as 0."""
         return {}
 
     def column(self, name: str) -> Column:
@@ -176,16 +184,31 @@ class Result:
         return text_table(self.printed_columns(columns))
 
     def printed_columns(self, columns: Columns) -> dict[Column, Sequence]:
-        """Columns as they are printed, without field_x where it is 0."""
+        """Columns as they are printed, without field_x where it is 0, and with 0 for rounding errors (`roundings`)."""
         listed: dict[Any, Any] = {**columns, **flat({k: v for k, v in columns.items() if isinstance(v, Tensor)})}
-        words, printed = self.words(), {}
+        words, roundings, printed = self.words(), self.roundings(), {}
         if "field_x" in listed and not np.any(listed["field_x"]):
             del listed["field_x"]
         for name, values in listed.items():
             counted = name in words and isinstance(columns[name], Tensor)
             column = self.column(name) if isinstance(name, str) else name
             printed[column] = [words[name][int(value)] for value in values] if counted else values
+            if column.name in roundings:
+                printed[column] = _without_rounding(values, roundings[column.name])
         return printed
+
+
+def rounding(*terms: Tensor) -> Tensor:
+    """Rounding () of sums and differences of quantities (...), by the largest of them; nan and inf are left out."""
+    sizes = (_ROUNDING * torch.finfo(term.dtype).eps * term.detach().abs().nan_to_num(0, 0, 0).max() for term in terms)
+    return functools.reduce(torch.maximum, sizes)
+
+
+def _without_rounding(values: Sequence, rounding: Tensor) -> list:
+    """Numbers of a column, 0 where they are below their rounding; texts as they are."""
+    limits = rounding.expand(len(values)).tolist()
+    pairs = zip(values, limits, strict=True)
+    return [v if isinstance(v, str) or not abs(float(v)) < limit else 0.0 for v, limit in pairs]
 
 
 def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:

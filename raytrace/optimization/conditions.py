@@ -333,20 +333,24 @@ def specified(
     lens: Lens,
     merit: Merit | DefaultMerit | Sequence[Row] | str | None,
     hold: str | Sequence[str | Condition] | None,
+    *,
+    stored: bool = True,
 ) -> tuple[Merit, tuple[Condition, ...]]:
     """The merit function of an optimisation, without its conditions, and all conditions, also off ones, in mm.
 
-    These are the conditions of the lens, of rows of negative weight of `merit`, and of `hold`, each of which replaces
-    those of the same quantity before it; hold None: without those of the lens. Warns ReplacedCondition. Raises BadHold.
+    These are the conditions of the lens, if `stored`, of rows of negative weight of `merit`, and of `hold`, each of
+    which replaces those of the same quantity before it; hold None: without those of the lens. Warns ReplacedCondition.
+    Raises BadHold.
     """
     function, current = merit_for(lens, merit), lens.current_configuration
     among = [*_of_rows(lens, function.rows, function.unit)]
     added = conditions_of(lens, hold)
-    of_lens = () if hold is None else stored_conditions(lens)
+    conditions = stored_conditions(lens)
+    of_lens = conditions if stored and hold is not None else ()
     data = lens.optimization_data
     of_file = len(data.merit) if data is not None and function.rows[: len(data.merit)] == data.merit else 0
     of_rows = [condition for k, condition in among if k > of_file]
-    for before in of_lens:
+    for before in conditions:
         if before.on and any(c.excludes(before, current) and c != before for c in added):
             other = next(c for c in added if c.excludes(before, current))
             message = f"{option('hold')}: {other} replaces {before}, a condition of the lens"
@@ -466,6 +470,19 @@ def _name(lens: Lens, condition: Condition, k: int) -> str:
     while numbers and float(numbers[-1]) == 0:
         numbers.pop()
     return f"{operand}({','.join(numbers)})" if numbers else operand
+
+
+def named_row(lens: Lens, rows: Sequence[Row], k: int, unit: float) -> Condition | None:
+    """Row k, from 1, as a condition with a name, whatever its weight, the primary wavelength as the default; unit: of
+    rows, mm. None for unknown operands."""
+    if rows[k - 1].operand not in OPERANDS:
+        return None
+    condition = _of_row(rows, k, unit)
+    row, takes = condition.row, OPERANDS[condition.row.operand].takes
+    if takes[1] == "wavelength" and row.integers[1] == lens.primary_wavelength and not condition.before:
+        row = dataclasses.replace(row, integers=(row.integers[0], 0))
+        condition = dataclasses.replace(condition, row=row)
+    return dataclasses.replace(condition, name=_name(lens, condition, k))
 
 
 def without_rows(rows: Sequence[Row], gone: Iterable[int]) -> tuple[Row, ...]:

@@ -689,7 +689,7 @@ _STEPS = 15_000
 
 
 class NoOptimum(RaytraceWarning):
-    """A descent ended where the error still falls; its last point is used."""
+    """A descent ended where the error still falls, or contacts of spacers still move; its last point is used."""
 
 
 Slope: TypeAlias = tuple[float, np.ndarray]  # a value and its gradient

@@ -156,6 +156,7 @@ class LossDescents:
     ):
         self.problem, self.loss = problem, loss
         self.function = FunctionMerit(problem.model, loss, evaluated)
+        self.functions = [self.function]  # and those of the same loss by denser rays
         self.settings: dict[str, Any] = {"lower": ends[0], "upper": ends[1], "typical": typical_of(problem.model)}
         self.history: list[Cycle] = []
         self.cycle_limit, self.deadline, self.stopped = 0, np.inf, ""
@@ -188,43 +189,57 @@ class LossDescents:
                 "reduce the fields or the aperture, or start from another lens"
             )
         best = self._descend(self.function, x, watch)
-        ends, checked, refined, evaluations = [best.state.cost], np.nan, 0, 0
-        random, loss = np.random.default_rng(0), self.loss
+        ends, checked, refined = [best.state.cost], np.nan, 0
+        random = np.random.default_rng(0)
         try:
-            least = self._judged(best)
+            loss = self.loss.denser()
+            function = self._by(loss)
+            least, checked = self._judged(best, function)
             for _ in range(restarts):
                 if self._is_over():
                     break
                 near = self._lifted(self.function).displaced(best.state.x, random)
                 descent = self._descend(self.function, near, watch)
                 ends.append(descent.state.cost)
-                judged = self._judged(descent)
-                best, least = (descent, judged) if judged.is_better(least) else (best, least)
-            while (denser := loss.denser()) is not None:
-                function, loss = FunctionMerit(self.problem.model, denser), denser
-                checked = _finite_or_inf(function, best.state.x)
+                judged, by_denser = self._judged(descent, function)
+                if judged.is_better(least):
+                    best, least, checked = descent, judged, by_denser
+            while loss is not None and function is not None:
                 is_same = abs(checked - best.state.cost) <= _DENSER_CHANGE * abs(checked)
                 if is_same or not np.isfinite(checked) or self._is_over() or refined == _ROUNDS:
                     break
                 best, refined = self._descend(function, best.state.x, watch), refined + 1
-                evaluations += function.evaluations
+                loss = loss.denser()
+                function = self._by(loss)
+                checked = np.nan if function is None else _finite_or_inf(function, best.state.x)
         except KeyboardInterrupt:  # outside the cycles of a descent
             self.stopped, checked = "interrupted", np.nan
         report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), best.state.cost, checked, refined, first)
         return LossDescent(
             best.state.x, tuple(self.history), self.stopped or best.stopped, cycles_used + len(self.history),
-            evaluations + self.function.evaluations, report,
+            self.evaluations, report,
         )  # fmt: skip
 
-    def _judged(self, descent: Descent) -> SumOfSquares:
-        """The end of a descent with the loss by denser rays, inf where these fail: few rays may fit a wide PSF that
-        more rays do not have."""
-        denser = self.loss.denser()
-        if denser is None:
-            return descent.state
+    @property
+    def evaluations(self) -> int:
+        """Of the loss, by all rays."""
+        return sum(function.evaluations for function in self.functions)
+
+    def _by(self, loss: Loss | None) -> FunctionMerit | None:
+        """The merit of the loss by denser rays, whose evaluations count."""
+        if loss is None:
+            return None
+        self.functions.append(FunctionMerit(self.problem.model, loss))
+        return self.functions[-1]
+
+    def _judged(self, descent: Descent, by_denser: FunctionMerit | None) -> tuple[SumOfSquares, float]:
+        """The end of a descent with the loss by denser rays, inf where these fail, and this loss: few rays may fit a
+        wide PSF that more rays do not have."""
+        if by_denser is None:
+            return descent.state, np.nan
         assert isinstance(descent.state, LiftedLoss)
-        loss = _finite_or_inf(FunctionMerit(self.problem.model, denser), descent.state.x)
-        return dataclasses.replace(descent.state, loss=loss)
+        loss = _finite_or_inf(by_denser, descent.state.x)
+        return dataclasses.replace(descent.state, loss=loss), loss
 
     def _is_over(self) -> bool:
         return bool(self.stopped) or len(self.history) >= self.cycle_limit or time.monotonic() > self.deadline
@@ -246,8 +261,8 @@ class LossDescents:
         offset, lifted = len(self.history), self._lifted(function)
 
         def record_cycle(cycle: Cycle, start: CycleStart) -> None:
-            evaluations = function.evaluations
-            self.history.append(dataclasses.replace(cycle, number=cycle.number + offset, evaluations=evaluations))
+            numbers = {"number": cycle.number + offset, "evaluations": self.evaluations}
+            self.history.append(dataclasses.replace(cycle, **numbers))
             if watch is not None:
                 watch(self.history[-1], start.x)
 

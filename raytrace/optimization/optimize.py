@@ -21,7 +21,7 @@ from raytrace.optimization.conditions import Condition, conditions_in_unit, spec
 from raytrace.optimization.contradictions import refuse_contradictions, with_reasons
 from raytrace.optimization.fitting import Design
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of
-from raytrace.optimization.least_squares import Cycle, PathProgress, best_of_paths
+from raytrace.optimization.least_squares import Cycle, NoOptimum, PathProgress, best_of_paths
 from raytrace.optimization.loss import Loss, LossDescents
 from raytrace.optimization.merit import DefaultMerit, Evaluated, Merit
 from raytrace.optimization.opening import Opened, opened
@@ -71,6 +71,7 @@ def optimize(
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = (),
+    stored: bool = True,
     as_built: ExpectationSettings | None = None,
     cycles: int | None = None,
     seconds: float | None = None,
@@ -98,8 +99,8 @@ def optimize(
     The end is judged by denser rays (`Optimized`), of check_rings rings, by default twice as many.
     vary: variables, or their syntax, as "curvature thickness:5,6" (surfaces 5 and 6), by default the file's; bounds: of
     variables, as "thickness:2..15" (mm); hold: conditions met exactly, as "efl=50 total_track<=80"
-    (`optimization.conditions`), in addition to `lens.conditions` and instead of those of the same quantity; None:
-    without those of the lens. The optimised lens has all of them.
+    (`optimization.conditions`), in addition to `lens.conditions` and instead of those of the same quantity; stored:
+    False, or None as `hold`: without those of the lens. The optimised lens has all of them.
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit.
     cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
@@ -139,7 +140,7 @@ def optimize(
             if setting is not None:
                 raise NoProblem(f"{option('vary', 'spacer')} goes without {option(name)}: leave one out")
         return _with_spacers(
-            lens, spaces, materials_of(mounts), vary, merit, hold, until, cycles=cycles, bounds=bounds,
+            lens, spaces, materials_of(mounts), vary, merit, hold, until, stored=stored, cycles=cycles, bounds=bounds,
             as_built=as_built, paths=paths, catalog=catalog, glasses=glasses, progress=progress, watch=watch,
         )  # fmt: skip
     warn_of_filling(lens, field_points(None, like=lens))
@@ -164,7 +165,7 @@ def optimize(
         if not least <= most:
             raise NoProblem(f"{option('bounds')} of {name}: from {least:g} to {most:g} there is nothing")
     typical = typical_of(model)
-    is_stored = checkpoint is not None or resume is not None
+    is_kept = checkpoint is not None or resume is not None
 
     def about(**of_merit: object) -> dict[str, object]:
         """All that a checkpoint depends on."""
@@ -172,7 +173,7 @@ def optimize(
         variables |= {"glasses that vary": list(chosen), "bounds": plain([lower.tolist(), upper.tolist()])}
         return {**identity(lens), **variables, **of_merit}
 
-    def stored(about: Mapping[str, object]) -> Stored:
+    def kept(about: Mapping[str, object]) -> Stored:
         return Stored(model.start, {}) if resume is None else read_checkpoint(resume, about, names)
 
     def observer(
@@ -192,18 +193,18 @@ def optimize(
     if loss is not None and (chosen or as_built is not None):
         words = option("vary", "glass") if chosen else option("as_built")
         raise NoProblem(f"{words} goes with a merit of rows, not with a function: leave it out")
-    rows, held = specified(lens, merit if loss is None else first or "spot", hold)
+    rows, held = specified(lens, merit if loss is None else first or "spot", hold, stored=stored)
     conditions, of_rows = conditions_in_unit(lens, held, rows.unit), rows.options
     term = None if as_built is None else as_built.of(model.lens)
     problem = Problem(model, rows.rows, conditions, as_built=term, **of_rows)
-    if is_stored:
+    if is_kept:
         dependencies = about(merit=digest([repr(row) for row in rows.rows], of_rows), hold=digest(repr(conditions)))
         dependencies |= {} if term is None else {"as built": digest(term.about())}
-    if is_stored and loss is not None:
+    if is_kept and loss is not None:
         name = getattr(loss, "__qualname__", type(loss).__name__)
         dependencies |= {"loss": name, "of": repr(quantity), "object distances": plain(object_distances)}
         dependencies |= {"restarts": restarts, "first": first is not None}
-    resumed = stored(dependencies)
+    resumed = kept(dependencies)
     if set(resumed.glasses) - set(chosen):
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*resumed.glasses]}, expected some of {[*chosen]}")
     start, opening = np.clip(resumed.x, lower, upper), Opened(resumed.x)
@@ -270,10 +271,13 @@ def optimize(
             cycles=0 if opening.interrupted else cycles, seconds=None if seconds is None else until - time.monotonic(),
             watch=seen.after_cycle_of_paths, resume=resumed.descent,
         )  # fmt: skip
-        for _ in range(_CONTACTS):
+        for turn in range(_CONTACTS + 1):
             design = lens_at(descent.state.x)
             moved = with_contacts(design)
             if moved is design or opening.interrupted or descent.stopped == "interrupted":
+                break
+            if turn == _CONTACTS:
+                _warn_of_contacts(design, moved)
                 break
             problem = Problem(
                 dataclasses.replace(problem.model, lens=moved), rows.rows, conditions, as_built=term, **of_rows
@@ -323,6 +327,21 @@ def optimize(
     )  # fmt: skip
 
 
+def _warn_of_contacts(design: Lens, moved: Lens) -> None:
+    """Warn NoOptimum with the semi-diameters in contact that a lens had in its last descent, and should have had."""
+    sizes = [
+        (k, float(before.semi_diameter), float(after.semi_diameter))
+        for k, (before, after) in enumerate(zip(design.surfaces, moved.surfaces, strict=True))
+        if before.semi_diameter and after.semi_diameter
+    ]
+    changes = ", ".join(f"surface {k} by {after - before:+.3g} mm" for k, before, after in sizes if after != before)
+    warnings.warn(
+        f"the semi-diameters at which spacers have contact still change after {_CONTACTS} more descents, with the "
+        f"last one: {changes}; the merit is that of the contacts before this change: optimise the lens again",
+        NoOptimum, stacklevel=calling_level(),
+    )  # fmt: skip
+
+
 def _refuse_beside_fit(fit: str, **given: bool) -> None:
     """Raise NoProblem for options that do not go with a fit to parts or test plates."""
     for name, is_given in given.items():
@@ -340,6 +359,7 @@ def _with_spacers(
     hold: Any,
     until: float,
     *,
+    stored: bool,
     cycles: int | None,
     **settings: Any,
 ) -> Optimized:
@@ -348,7 +368,7 @@ def _with_spacers(
     fixed = without_glasses(vary)
 
     def problem(lens: Lens) -> Problem:
-        rows, held = specified(lens, merit, hold)
+        rows, held = specified(lens, merit, hold, stored=stored)
         model = design_variables(lens, fixed)
         return Problem(model, rows.rows, conditions_in_unit(lens, held, rows.unit), **rows.options)
 
@@ -357,7 +377,9 @@ def _with_spacers(
         left = None if np.isinf(until) else max(until - time.monotonic(), 1e-3)
         more = settings if cycles is None else {**settings, "progress": None, "watch": None}
         count = whole if cycles is None else min(cycles, whole or cycles)
-        return optimize(lens, merit=merit, vary=words, hold=hold, cycles=count, seconds=left, **more)
+        return optimize(
+            lens, merit=merit, vary=words, hold=hold, stored=stored, cycles=count, seconds=left, **more
+        )  # fmt: skip
 
     whole = cycles
     first = optimised(lens, cycles=None)

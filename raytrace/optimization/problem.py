@@ -320,25 +320,25 @@ class FunctionMerit:
     """A function of a lens as a merit over the variables of a model, with its gradient, carried through solves.
 
     evaluated: (E, n + 1 + n) variables, value and gradient of earlier evaluations: a resumed descent repeats these
-    without evaluating. An evaluation at the variables of the last one is not repeated.
+    without evaluating, but counts them. An evaluation at variables of an earlier one is not repeated.
     """
 
     def __init__(
         self, model: DesignVariables, function: Callable[[Lens], Tensor], evaluated: Iterable[np.ndarray] = ()
     ):
         self.model, self.function, self.evaluations = model, function, 0
-        self.last: np.ndarray | None = None
         self.evaluated: list[np.ndarray] = [*evaluated]
         self.known = {evaluation[: len(evaluation) // 2].tobytes(): evaluation for evaluation in self.evaluated}
+        self.counted: set[bytes] = set()
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """The merit and its gradient (n,)."""
         x = np.array(x, dtype=float)
-        if self.last is not None and x.tobytes() == self.last[: len(x)].tobytes():
-            return float(self.last[len(x)]), self.last[len(x) + 1 :].copy()
-        self.evaluations += 1
-        if (known := self.known.get(x.tobytes())) is not None:
-            self.last = known
+        key = x.tobytes()
+        known = self.known.get(key)
+        self.evaluations += known is None or key not in self.counted
+        self.counted.add(key)
+        if known is not None:
             return float(known[len(x)]), known[len(x) + 1 :].copy()
         variables = torch.tensor(x, requires_grad=True)
         with torch.enable_grad():
@@ -347,8 +347,8 @@ class FunctionMerit:
         if merit.requires_grad:
             slope = torch.autograd.grad(merit, variables, materialize_grads=True)[0].numpy()
         value = float(merit.detach())
-        self.last = np.array([*x, value, *slope])
-        self.evaluated.append(self.last)
+        self.known[key] = np.array([*x, value, *slope])
+        self.evaluated.append(self.known[key])
         return value, slope
 
 

@@ -393,6 +393,7 @@ def search(
     vary: str | Sequence[str] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = (),
+    stored: bool = True,
     starts: int | None = None,
     moves: str | Sequence[str] | None = None,
     elements: int | str | Sequence[int] | None = None,
@@ -409,8 +410,8 @@ def search(
 ) -> Searched:
     """The distinct minima of a merit function globally, within bounds; the lens is one of the starts.
 
-    merit, vary, bounds, hold: as for `optimize`; default bounds follow from the focal length (`search_tasks.py`),
-    which is that of `hold`, of a row EFFL or of the lens. starts: how many. kind: "phone", a curriculum from plates of
+    merit, vary, bounds, hold, stored: as for `optimize`; default bounds follow from the focal length, that of `hold`,
+    of a row EFFL or of the lens (`search_tasks.py`). starts: how many. kind: "phone", a curriculum from plates of
     plastic to a wide and fast lens of aspheres, in steps of aperture, field and terms (`curriculum.py`); `hold` its
     focal length; merit: None or a `DefaultMerit`. seconds: after which it ends; seed: of the draws.
     moves: words of moves from the lens at its minimum, or with `starts` from the best minima: "insert" a meniscus
@@ -453,13 +454,13 @@ def search(
     if kind is not None:
         if merit is not None and not isinstance(merit, DefaultMerit):
             raise NoProblem(f"{option('kind', kind)} has a merit function of its own: leave {option('merit')} out")
-        _, held = specified(lens, DefaultMerit(), hold)
+        _, held = specified(lens, DefaultMerit(), hold, stored=stored)
         words = [str(condition) if condition.is_worded else condition for condition in held if condition.on]
         plan = Plan(kind, lens, vary, bounds, words, merit if isinstance(merit, DefaultMerit) else None)
         task = plan.problem(lens, plan.curriculum.steps[0])
         starts = plan.curriculum.starts if starts is None else starts
     else:
-        (function, held), free = specified(lens, merit, hold), design_variables(lens, vary)
+        (function, held), free = specified(lens, merit, hold, stored=stored), design_variables(lens, vary)
         ends, conditions = bounds_of(free.lens, free.variables, bounds), conditions_in_unit(lens, held, function.unit)
         glass, air = function.boundaries.glass, function.boundaries.air
         task = SearchProblem(free, function.rows, conditions, ends, glass, air, function.options)

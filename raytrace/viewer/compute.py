@@ -35,7 +35,7 @@ from raytrace.tracing.geometry import defects, fixed_semi_diameters, mechanical_
 from raytrace.tracing.launch import unfilled
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import ray_failures
-from raytrace.viewer.state import State, has_merit, shown_fields, slider_ends, word_of
+from raytrace.viewer.state import State, has_merit, named, shown_fields, slider_ends, word_of
 
 _detached = shared(detached)
 
@@ -346,7 +346,8 @@ def _conditions(lens: Lens) -> list[dict]:
         results, conditions = attained_by(lens), lens.conditions
     except ValueError as error:  # of a surface that is gone
         return [{"words": str(error), "row": 1, "on": True, "reached": None, "met": False}]
-    values = iter(results)
+    rows = lens.optimization_data.merit if lens.optimization_data else ()
+    values = iter([named(lens, rows, result) for result in results])
     listed = []
     for condition in conditions:
         value = next(values) if condition.on else None

@@ -27,6 +27,7 @@ from raytrace.viewer.state import (
     in_words,
     initial,
     merit_of,
+    named,
     reduce,
     refusal,
     requirements,
@@ -54,8 +55,7 @@ class Optimisation:
     def __init__(self, state: State):
         self.lens, self.is_stopped = state.lens, False
         self.merits: list[float] = []
-        rows = [row for row in requirements(state.lens) if row.weight != 0]
-        self.required = [*dict.fromkeys(map(in_words, rows))]
+        self.required = in_words(state.lens, requirements(state.lens))
         self.result: Optimized | None = None
         self.failure = ""
         self.thread = threading.Thread(target=self._run, args=(state,), daemon=True)
@@ -77,7 +77,8 @@ class Optimisation:
     def words(self) -> str:
         count = f"{len(self.merits)} cycle{'' if len(self.merits) == 1 else 's'}"
         if self.result is not None:
-            missed = [str(condition) for condition in self.result.conditions if not condition.met]
+            end, rows = self.result.lens, self.result.merit
+            missed = [str(named(end, rows, condition)) for condition in self.result.conditions if not condition.met]
             before, after = self.result.merit_before, self.result.merit_after
             reason = STOPPED[self.result.stopped]
             return "; ".join([f"{count}, merit {before:.6g} → {after:.6g}: {reason}", *self._of_file, *missed])

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.mtf import frequency_range
-from raytrace.optimization.conditions import Condition, conditions_of
-from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, arguments, merit_for
+from raytrace.optimization.attained import Attained
+from raytrace.optimization.conditions import Condition, conditions_of, named_row
+from raytrace.optimization.merit import KINDS, DefaultMerit, Merit, merit_for
 from raytrace.optimization.operands.mtf import MODULATION
 from raytrace.optimization.operands.rays import RAYS
-from raytrace.optimization.operands.table import OPERANDS
 from raytrace.optimization.operands.wavefront import PATH, QUALITY
 from raytrace.optimization.variables import DesignVariables, design_variables
 from raytrace.plotting import style
@@ -190,10 +190,19 @@ def requirements(lens: Lens) -> Merit:
     return Merit(tuple(free), data.unit if data else 1.0)
 
 
-def in_words(row: Row) -> str:
-    """A row and its target, as "EFFL = 50"."""
-    relation = (OPERANDS[row.operand].bounds if row.operand in OPERANDS else "") or "="
-    return " ".join(filter(None, (row.name, arguments(row), relation, f"{row.target:.6g}")))
+def in_words(lens: Lens, merit: Merit) -> list[str]:
+    """The rows of a merit function that have a weight, as "efl=50"."""
+    words = []
+    for k, row in enumerate(merit.rows, 1):
+        condition = named_row(lens, merit.rows, k, merit.unit) if row.weight else None
+        words += [str(condition)] if condition else [f"{row.name}={row.target:.6g}"] if row.weight else []
+    return [*dict.fromkeys(words)]
+
+
+def named(lens: Lens, rows: Sequence[Row], result: Attained) -> Attained:
+    """A result of a boundary or row of a merit function under the name that conditions have, as "edge"."""
+    condition = named_row(lens, rows, result.row, 1.0) if result.row else None
+    return dataclasses.replace(result, name=condition.quantity) if condition else result
 
 
 # -- numbers

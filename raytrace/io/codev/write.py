@@ -36,14 +36,15 @@ from raytrace.io.source import (
     thickness,
     word,
 )
+from raytrace.materials.environment import REFERENCE, thermal
 from raytrace.materials.glass import Glass
 from raytrace.system.apertures import Aperture
 from raytrace.system.configurations import same
-from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.lens import Lens, SystemAperture, index_behind
 from raytrace.system.phases import RadialPhase
 from raytrace.system.poses import Pose, undone
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.system.surface import SIZES, Surface
+from raytrace.system.surface import SIZES, Surface, medium_surfaces
 from raytrace.words import option
 
 #: Digits of a written coefficient of a phase, enough to read back the same number through two roundings.
@@ -52,13 +53,17 @@ _DIGITS = 40
 #: Characters of a line, after which a list continues in the next.
 _LINE = 72
 
+#: Difference of two indices by rounding alone.
+_SAME_INDEX = 1e-14
+
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     """The content of a .seq file of the lens, in mm, its surfaces by their curvatures.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
     Raises LensFileError for data that a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰,
-    apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
+    apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses, temperatures and
+    pressures that change an index.
     """
     place = Place(file)
     private: dict[str, Glass] = {}
@@ -71,9 +76,7 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 
 def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     fields = lens.fields
-    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
-        message = "a temperature or pressure, which a .seq file does not hold here"
-        raise LensFileError(f"{message}; write a table (.csv)", place)
+    _refuse_environments(lens, place)
     if fields.telecentric:
         raise LensFileError("a telecentric object space, which a .seq file does not hold here", place)
     waves = [codev_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
@@ -94,6 +97,29 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         *_vignetting(lens, place),
         *(_wrapped(line.split(" ")) for line in codev_glass.private_lines(private, waves, place)),
     ]
+
+
+def _refuse_environments(lens: Lens, place: Place) -> None:
+    """Raises LensFileError for an environment whose indices differ from those without one, which are read back."""
+    places = [lens.environment, *(surface.environment for surface in lens.surfaces)]
+    for air in filter(None, places):
+        if ((air.temperature != REFERENCE[0]) | (air.pressure != REFERENCE[1])).any():
+            message = f"a temperature or pressure other than {REFERENCE[0]:g} °C and {REFERENCE[1]:g} atm"
+            raise LensFileError(f"{message}, which a .seq file does not hold here; write a table (.csv)", place)
+    if not any(places):
+        return
+    surfaces = tuple(dataclasses.replace(surface, environment=None) for surface in lens.surfaces)
+    bare = dataclasses.replace(lens, surfaces=surfaces, environment=None)
+    wavelengths = lens.wavelengths.double()
+    for number in medium_surfaces(lens.surfaces):
+        here, listed = (index_behind(either, number, wavelengths) for either in (lens, bare))
+        if ((here - listed).abs() > _SAME_INDEX).any():
+            glass = lens.surfaces[number].glass
+            raise LensFileError(
+                f"{glass.name} at {REFERENCE[0]:g} °C, whose catalog is of {thermal(glass).reference:g} °C: a .seq "
+                "file does not hold the temperature here; write a table (.csv)",
+                Place(place.file, None, number),
+            )
 
 
 def _weights(numbers: Tensor, quantity: str, place: Place) -> list[str]:
