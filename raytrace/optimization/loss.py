@@ -261,8 +261,8 @@ class LossDescents:
         offset, lifted = len(self.history), self._lifted(function)
 
         def record_cycle(cycle: Cycle, start: CycleStart) -> None:
-            numbers = {"number": cycle.number + offset, "evaluations": self.evaluations}
-            self.history.append(dataclasses.replace(cycle, **numbers))
+            number = cycle.number + offset
+            self.history.append(dataclasses.replace(cycle, number=number, evaluations=self.evaluations))
             if watch is not None:
                 watch(self.history[-1], start.x)
 
