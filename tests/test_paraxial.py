@@ -215,6 +215,16 @@ def test_the_f_number_of_an_image_in_glass_is_of_the_focal_length_in_air():
     assert first_order(system).f_number.item() == pytest.approx(number, rel=1e-12)
 
 
+def test_an_object_at_surface_1_has_the_numerical_aperture_of_its_cone():
+    system = lens([surface(None, 100.0), surface(0.02, 5.0, 1.5), surface(-0.02, 60.0)], object_distance=0.0, stop=2,
+                  aperture=("object_na", 0.05))  # fmt: skip
+    near = first_order(with_object_distance(system, 1e-9))
+    data = first_order(system)
+    assert data.object_na.item() == pytest.approx(0.05, rel=1e-12)
+    assert data.image_na.item() == pytest.approx(near.image_na.item(), rel=1e-9)
+    assert data.paraxial_working_f_number.item() == pytest.approx(near.paraxial_working_f_number.item(), rel=1e-9)
+
+
 def stop_height(system, data):
     """Height at the stop of the paraxial ray through the edge of the entrance pupil, from real rays at 1e-6 of it."""
     n0 = 1e-6 * data.entrance_pupil_diameter / 2

@@ -1001,7 +1001,8 @@ def check(lens: Lens) -> None:
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool(lens.fields.extent >= 90):
-        raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+        extent = f"{option('fields')} reach {float(lens.fields.extent):g} degrees"
+        raise ValueError(f"{extent}; expected below 90 degrees: rays start from the plane of the entrance pupil")
 
 
 def _check_environments(lens: Lens) -> None:

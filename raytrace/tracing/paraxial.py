@@ -399,7 +399,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     data, diameter, vergence = beam.data, beam.entrance_pupil_diameter, beam.vergence
     n_object, n_image = data.n_object, data.n_image
     A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
-    kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
+    kind, distance, tan_cone = lens.aperture.kind, object_distance_of(lens), _tan_cone(lens, n_object)
     scale = data.marginal_height(kind, diameter, distance, vergence, tan_cone)
     slope_object, slope_image = scale * vergence / n_object, scale * data.omega_behind(vergence) / n_image
     # |n ū y| at the entrance pupil, |n u h| at the object or |n′ u′ h′| at the image, by the kind of field.
