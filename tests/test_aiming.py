@@ -78,6 +78,19 @@ def test_the_miss_of_the_stop_is_that_of_traced_rays():
     assert found.chief[0] < 1e-12 < TOLERANCE < found.chief[2]
 
 
+@pytest.mark.parametrize("angle", [60.0, 80.0, 88.0, 89.5])
+def test_rays_of_wide_angle_lenses_are_aimed(angle):
+    """A meniscus that takes in nearly half of space, the stop close behind it."""
+    rows = [dict(radius=20, thickness=0.8, glass=1.75), dict(radius=3, thickness=2.5), dict(thickness=8)]
+    lens = rt.lens(rows, stop=3, entrance_pupil_diameter=0.4, fields=[angle], wavelengths=[0.55], ray_aiming="real")
+    points = torch.cat([torch.zeros(2, 1, dtype=torch.float64), RIM, -RIM], 1)
+    rays = launch(lens, points)
+    (position, _), arrives = at_stop(lens, rays, lens.primary), rays.valid
+    assert arrives.all()
+    radius = filling(lens, torch.zeros(2, 1, dtype=torch.float64)).radius
+    assert torch.allclose(position[:2].reshape(2, -1) / radius, points, atol=1e-9)
+
+
 def test_a_beam_that_misses_the_stop_is_reported_once_with_figures_and_a_remedy(capsys):
     lens = fisheye()
     with pytest.warns(UnfilledStop, match=r"field 40 degrees: rays miss the stop, .* chief ray by .* % of it from the "

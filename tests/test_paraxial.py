@@ -15,7 +15,7 @@ from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surfa
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.io import read_lens, write_lens
-from raytrace.materials.glass import MIRROR
+from raytrace.materials.glass import MIRROR, constant
 from raytrace.system.lens import media, with_object_distance
 from raytrace.system.rays import start
 from raytrace.tracing.f_number import working_f_number
@@ -196,6 +196,33 @@ def test_every_kind_of_aperture_gives_the_beam_it_means(kind):
         "float_by_stop": stop_height(system, data),
     }
     assert meaning[kind].item() == pytest.approx(number, rel=1e-13)
+
+
+def test_the_f_number_of_an_image_in_glass_is_of_the_focal_length_in_air():
+    """Of a distant object it is 1/(2 n′ u′). For a concentric relay at F/0.5, object and image in glass, OpticStudio
+    stores the semi-diameter of the stop (Dyson 1959, in nzhagen/LensLibrary)."""
+    n, number = 1.5058500185530872, 0.5
+    distant = first_order(lens([surface(0.05, 60.0, n)], aperture=("image_f_number", number)))
+    assert distant.paraxial_working_f_number.item() == pytest.approx(number, rel=1e-12)
+    assert distant.entrance_pupil_diameter.item() == pytest.approx(1 / (0.05 * (n - 1) * number), rel=1e-12)
+    near, far = -0.027832623508658449, -0.01
+    relay = [surface(near, 64.1), surface(far, -64.1, MIRROR), surface(near, -35.91951355497, n)]
+    system = lens(relay, aperture=("image_f_number", number), object_distance=35.9, stop=2, wavelengths=(0.253,))
+    heights = fields("object_height", (0.0, 2.0, 4.0))
+    immersed = dataclasses.replace(system.surfaces[0], glass=constant(n))
+    system = dataclasses.replace(system, surfaces=(immersed, *system.surfaces[1:]), fields=heights, ray_aiming="off")
+    assert system.with_semi_diameters().surfaces[2].semi_diameter == pytest.approx(31.54521074503, rel=1e-10)
+    assert first_order(system).f_number.item() == pytest.approx(number, rel=1e-12)
+
+
+def test_an_object_at_surface_1_has_the_numerical_aperture_of_its_cone():
+    system = lens([surface(None, 100.0), surface(0.02, 5.0, 1.5), surface(-0.02, 60.0)], object_distance=0.0, stop=2,
+                  aperture=("object_na", 0.05))  # fmt: skip
+    near = first_order(with_object_distance(system, 1e-9))
+    data = first_order(system)
+    assert data.object_na.item() == pytest.approx(0.05, rel=1e-12)
+    assert data.image_na.item() == pytest.approx(near.image_na.item(), rel=1e-9)
+    assert data.paraxial_working_f_number.item() == pytest.approx(near.paraxial_working_f_number.item(), rel=1e-9)
 
 
 def stop_height(system, data):

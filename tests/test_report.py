@@ -114,11 +114,20 @@ def test_the_contents_name_the_page_of_every_section(report):
     lines = pages[0].partition("Contents\n")[2].splitlines()
     count = len(report.content.sections)
     for number, section in enumerate(report.content.sections, 1):
+        assert lines[2 * number - 2 : 2 * number] == [str(number), section.title]
         entry = re.compile(rf"{number}\s+{re.escape(section.title)}")
-        assert entry.fullmatch(lines[number - 1])
-        named = int(lines[count + number - 1])
         places = [k for k, text in enumerate(pages, 1) for line in text.splitlines() if entry.fullmatch(line)]
-        assert places == sorted([1, named])
+        assert places == [int(lines[2 * count + number - 1])]
+
+
+def test_titles_of_figures_leave_the_name_of_the_lens_to_the_head(report):
+    figures = [
+        block.figure for section in report.content.sections for block in section.blocks if hasattr(block, "figure")
+    ]
+    titles = [" ".join(figure.get_suptitle().split()) for figure in figures]
+    assert "Ray fans" in titles
+    assert "Field curvature" in titles
+    assert {title for title in titles if report.lens.name in title} <= {report.lens.name}
 
 
 def test_no_text_leaves_the_page_and_no_figure_overlaps_one(report):

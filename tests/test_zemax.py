@@ -7,6 +7,7 @@ import re
 import pytest
 from problems_zemax import file, lens, read
 
+import raytrace as rt
 from raytrace.io import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens
 from raytrace.io.source import Place, decode
 from raytrace.materials.catalogs import UnknownGlass, find_glass
@@ -369,6 +370,28 @@ def test_repeated_keyword_warns_and_the_last_counts():
 def test_files_that_lost_their_indentation():
     text = "\n".join(line.strip() for line in file(tail="BLNK\nEFFL 0 2").split("\n"))
     assert float(read(text)[0].surfaces[2].thickness) == 47.5
+
+
+def test_files_with_other_indentation():
+    """Every line indented, as OpTaliX writes them, and surface 0 alone without, as DeepLens does."""
+    text = file(tail="BLNK\nEFFL 0 2\nMNUM 1 1")
+    straight, report = read("\n".join(f" {line}" for line in text.split("\n")))
+    assert [float(s.thickness) for s in straight.surfaces] == [math.inf, 4.0, 47.5, 0.0]
+    assert report.warnings == ()
+    assert [row.operand for row in straight.optimization_data.merit] == ["BLNK", "EFFL"]
+    before, after = text.split("SURF 1", 1)
+    mixed, report = read("SURF 1".join([before.replace("\n  ", "\n"), after]))
+    assert [float(s.thickness) for s in mixed.surfaces] == [math.inf, 4.0, 47.5, 0.0]
+    assert report.warnings == ()
+
+
+def test_an_object_at_1e10_is_at_infinity(tmp_path):
+    """OpticStudio has infinity there; other programs write 1e20."""
+    for distance, expected in [("1.0E+10", math.inf), ("0.1E+21", math.inf), ("9e9", 9e9)]:
+        found = read(file().replace("DISZ INFINITY", f"DISZ {distance}"))[0]
+        assert float(found.surfaces[0].thickness) == expected
+    with pytest.raises(LensFileError, match=r"surface 0: the object is 2\d+\.0 mm away, .*; make it inf"):
+        write_lens(rt.with_object_distance(found, 2e10), tmp_path / "far.zmx")
 
 
 def test_fortran_exponents():

@@ -104,7 +104,7 @@ OPTIONS: dict[str, Option] = {row.name: row for row in (
     Option("magnification", finite, "M", "of the paraxial image, as -0.1: the object distance that gives it, and the "
            "sensor there unless --sensor-distance is given"),
     Option("sensor_distance", finite, "MM", "from the last vertex before the image to the image"),
-    Option("f_number", positive_finite, "N", "image-space F/#: focal length / entrance pupil diameter"),
+    Option("f_number", positive_finite, "N", "image-space F/#: focal length in air / entrance pupil diameter"),
     Option("entrance_pupil_diameter", positive_finite, "MM", "diameter of the entrance pupil",
            flag="--entrance-pupil-diameter --epd"),
     Option("wavelengths", positive_finite, "UM", "wavelengths in µm; the first is primary", flag="--wavelength",

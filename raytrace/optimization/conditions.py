@@ -248,7 +248,7 @@ _INSTEAD = {
 #: Quantities of constraint syntax; each is the number of the analysis of that name.
 WORDS = {
     "efl": Word("EFFL", "effective focal length"),
-    "f_number": Word("ISFN", "focal length / entrance pupil diameter", ""),
+    "f_number": Word("ISFN", "focal length in air / entrance pupil diameter", ""),
     "working_f_number": Word("WFNO", "of the real cone on the axis", ""),
     "numerical_aperture": Word("ISNA", "of the image, paraxial", ""),
     "magnification": Word("PMAG", "paraxial, of an object at a finite distance", ""),

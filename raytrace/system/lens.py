@@ -52,7 +52,7 @@ RAY_AIMING = {
 #: The unit and meaning of the number of a system aperture.
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
-    "image_f_number": "EFL / entrance pupil diameter",
+    "image_f_number": "EFL in air / entrance pupil diameter",
     "paraxial_working_f_number": "paraxial working F/#",
     "object_na": "n sin θ of the marginal ray at the object",
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
@@ -480,8 +480,8 @@ class Lens:
         object_distance: mm from the object to surface 1, inf allowed; the sensor distance is unchanged: refocus by
         `rt.focus`; magnification: of the paraxial image, instead: the object where the image has it, by first-order
         data at the primary wavelength, and the sensor in that image unless sensor_distance is given;
-        sensor_distance: mm from the last surface before the image; f_number: image-space,
-        EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in weight and the first one primary
+        sensor_distance: mm from the last surface before the image; f_number: image-space, EFL in air /
+        entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in weight and the first one primary
         unless wavelength_weights (W,) and primary_wavelength, its number from 1, are given; fields: y, or (x, y), in
         the lens's own kind, without vignetting factors, alike in weight unless field_weights (F,) are given; weights:
         relative;
@@ -1001,7 +1001,8 @@ def check(lens: Lens) -> None:
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool(lens.fields.extent >= 90):
-        raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+        extent = f"{option('fields')} reach {float(lens.fields.extent):g} degrees"
+        raise ValueError(f"{extent}; expected below 90 degrees: rays start from the plane of the entrance pupil")
 
 
 def _check_environments(lens: Lens) -> None:

@@ -45,11 +45,14 @@ def aim_at_stop(
 ) -> tuple[Tensor, Tensor]:
     """Entrance pupil points (2, ...) whose rays pass the stop at turned(pupil) times `radius`; whether they pass (...).
 
+    Light at an angle θ that enters a length δ in front of the paraxial entrance pupil crosses it at δ tan θ from the
+    axis: the points of a wide-angle lens grow as 1/cos θ.
     pupil: (2, ...), initial points too; radius: mm, negative where the entrance pupil is an inverted image of the stop;
     through(pupil, fraction): rays of a fraction of the field.
     """
     pupil = with_batch_axes(pupil, radius.dim())  # the radius may have an axis of object distances that points lack
-    target, first = turned(pupil), through((pupil[..., :1] if pupil.dim() > 1 else pupil).detach(), 1.0)
+    first_point = (pupil[..., :1] if pupil.dim() > 1 else pupil).detach()
+    target, first = turned(pupil), through(first_point, 1.0)
     on_stop = points_at(lens, wavelength, (lens.stop,))
 
     def missed(aim: Tensor, fraction: float, target: Tensor = target) -> tuple[Tensor, Tensor]:
@@ -81,7 +84,14 @@ def aim_at_stop(
     given = lens, first, target, radius, wavelength
     batch = broadcast_shape(pupil.shape[1:], first.shape, wavelength.shape, batch_shape(lens))
     start = with_batch_axes(pupil.detach(), len(batch)).expand(2, *batch)
-    aim, is_root = _root(missed, start, origin=lambda start: start, given=given, near=near if of_one_pupil else None)
+    aim, is_root = _root(
+        missed,
+        start,
+        origin=lambda start: start,
+        given=given,
+        near=near if of_one_pupil else None,
+        size=lambda fraction: safe_divide(torch.ones_like(start[0]), through(first_point, fraction).direction[2].abs()),
+    )
     return torch.stack([torch.where(is_root, at_root, to) for at_root, to in zip(aim, pupil, strict=True)]), is_root
 
 
@@ -141,18 +151,20 @@ def _root(
     origin: Callable[[Tensor], Tensor],
     given: object,
     near: Callable[[], tuple[Tensor, Tensor]] | None = None,
+    size: Callable[[float], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Unknowns (n, ...) where the residuals of the full field vanish, and whether they do (...).
 
     start: of every root; origin: axial roots; given: all numbers on which the residuals depend; near: makes starts
-    (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first.
+    (n, ...), and the columns (n, n, ...) of inverse Jacobians, for chord steps that are tried first; size: by which the
+    roots grow at a fraction of the field, 1 if None.
     """
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
     # Roots not found are evaluated on the axis, where every derivative is finite.
     root, is_root = origin(start), torch.zeros_like(start[0], dtype=torch.bool)
     last_step, close = torch.zeros_like(root), _CLOSE * tolerance
     searches: list[Callable[[], tuple[Tensor, Tensor, Tensor]]] = [
-        partial(_followed, residual, start, origin(start), stages, close) for stages in _STAGES
+        partial(_followed, residual, start, origin(start), stages, close, size) for stages in _STAGES
     ]
     if near is not None and not in_transform():
         searches.insert(0, partial(_chords, residual, near, close))
@@ -188,21 +200,29 @@ def _chords(
 
 
 def _followed(
-    residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float
+    residual: Residual,
+    start: Tensor,
+    origin: Tensor,
+    stages: int,
+    close: float,
+    size: Callable[[float], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The roots at the full field, by continuation from the axis, their errors, and the next Newton step."""
-    # A stage starts from the extrapolation of the two before or, if better, from the last root. A Newton step that
-    # loses the ray or increases the residual is shortened and rejected.
+    # A stage starts from the extrapolation of the two before or, if better, from the last root, both relative to their
+    # sizes. A Newton step that loses the ray or increases the residual is shortened and rejected.
     before, root = origin, origin + (start - origin) / stages
     sought = torch.ones_like(root[0], dtype=torch.bool)
     for stage in range(1, stages + 1):
         fraction = stage / stages
+        earlier, last = before, root
+        if size is not None and stage > 1:
+            earlier, root = (size(fraction) / size((stage - k) / stages) * t for k, t in ((2, before), (1, root)))
         error, step = _error_and_step(residual, root, fraction)
         if stage > 1:
-            ahead = 2 * root - before
+            ahead = 2 * root - earlier
             error_ahead, step_ahead = _error_and_step(residual, ahead, fraction)
             nearer = _length(error_ahead) < _length(error)
-            before, root = root, torch.where(nearer, ahead, root)
+            before, root = last, torch.where(nearer, ahead, root)
             error, step = torch.where(nearer, error_ahead, error), torch.where(nearer, step_ahead, step)
         share = torch.ones_like(root[0])
         for _ in range(_STEPS):

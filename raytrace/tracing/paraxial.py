@@ -31,7 +31,7 @@ LINES = (
     ("effective focal length", "effective_focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
     ("front focal distance", "front_focal_distance", "mm, from surface 1"),
-    ("F/#", "f_number", "focal length / entrance pupil diameter"),
+    ("F/#", "f_number", "focal length in air / entrance pupil diameter"),
     ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
     ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
     ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
@@ -64,7 +64,8 @@ class FirstOrder(Result):
     entrance_pupil_position: from surface 1; entrance_pupil_diameter > 0.
     exit_pupil_position: from the image surface; exit_pupil_diameter > 0.
     stop_height: of the marginal ray at the stop; negative where the entrance pupil is an inverted image of the stop.
-    f_number: |EFL| / entrance pupil diameter; paraxial_working_f_number: 1/(2 n′ |u′|) of the marginal ray.
+    f_number: 1/|power| / entrance pupil diameter, which is 1/(2 n′ |u′|) for a distant object;
+        paraxial_working_f_number: 1/(2 n′ |u′|) of the marginal ray.
     paraxial_image_distance: from the last surface before the image to the paraxial image of the object.
     magnification: of that image (0 for an object at infinity).
     angular_magnification: ū′/ū of the chief ray, the slopes through the centres of the pupils.
@@ -188,6 +189,11 @@ class Gaussian:
         return quotient(-abs(self.n_image), self.C)
 
     @property
+    def focal_length_in_air(self) -> Number:
+        """1/power, mm, signed as the effective focal length, which is longer by the index of image space."""
+        return quotient(-1.0, self.C)
+
+    @property
     def entrance_pupil_position(self) -> Number:
         """mm from surface 1."""
         return self.n_object * self.front[1] / self.front[0]
@@ -227,7 +233,7 @@ class Gaussian:
         if kind == "entrance_pupil_diameter":
             return number
         if kind == "image_f_number":
-            return abs(self.effective_focal_length) / number
+            return abs(self.focal_length_in_air) / number
         if kind == "float_by_stop":
             return 2 * number / abs(self.front[0])
         if kind == "paraxial_working_f_number":
@@ -393,7 +399,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     data, diameter, vergence = beam.data, beam.entrance_pupil_diameter, beam.vergence
     n_object, n_image = data.n_object, data.n_image
     A, C, D, focal_length = data.A, data.C, data.D, data.effective_focal_length
-    kind, distance, tan_cone = lens.aperture.kind, lens.surfaces[0].thickness, _tan_cone(lens, n_object)
+    kind, distance, tan_cone = lens.aperture.kind, object_distance_of(lens), _tan_cone(lens, n_object)
     scale = data.marginal_height(kind, diameter, distance, vergence, tan_cone)
     slope_object, slope_image = scale * vergence / n_object, scale * data.omega_behind(vergence) / n_image
     # |n ū y| at the entrance pupil, |n u h| at the object or |n′ u′ h′| at the image, by the kind of field.
@@ -418,7 +424,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         exit_pupil_position=exit_distance - surfaces[-1].thickness,
         exit_pupil_diameter=exit_diameter,
         stop_height=beam.stop_height,
-        f_number=focal_length.abs() / diameter,
+        f_number=abs(data.focal_length_in_air) / diameter,
         paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=data.image_distance(vergence),
         magnification=beam.magnification,

@@ -23,6 +23,7 @@ _WHOLE = 0.35  # of a page: shorter tables are not divided
 _SHRUNK, _FILLING = 0.8, 0.7  # least scales of a figure at the end of a page, and of figures that fill one
 _FOOT = 12.0  # below a table
 _HEAD = 34.0  # the heading of a section
+_NAMES = 24.0  # from the left edge to the names in the list of contents
 _LINES = 3  # paragraphs that stay with the table behind them
 _WRAPPED = 90.0  # least width of a column whose texts are set in several lines
 
@@ -144,8 +145,8 @@ def _front(document: Document) -> _Piece:
     piece.texts.append((0, y + 8, "Contents", {"fontsize": 11, "weight": "bold"}))
     y += 24
     for k, section in enumerate(document.sections, 1):
-        name = f"{k}   {section.title}"
-        piece.texts.append((6, y, name, {"fontsize": _TEXT}))
+        piece.texts.append((_NAMES - 8, y, str(k), {"fontsize": _TEXT, "ha": "right"}))
+        piece.texts.append((_NAMES, y, section.title, {"fontsize": _TEXT}))
         y += 13
     piece.height = y + 14
     return piece
@@ -154,7 +155,7 @@ def _front(document: Document) -> _Piece:
 def _fill_contents(document: Document, pages: list[list[tuple[float, _Piece]]], starts: Sequence[int]) -> None:
     """Page numbers of the list of contents, with lines that lead to them."""
     front = pages[0][0][1]
-    entries = front.texts[len(front.texts) - len(document.sections) :]
+    entries = front.texts[len(front.texts) - 2 * len(document.sections) + 1 :: 2]
     for (x, y, name, _), page in zip(entries, starts, strict=True):
         end = x + style.text_width(name, _TEXT) + 6
         number = str(page)

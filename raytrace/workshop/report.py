@@ -38,6 +38,7 @@ from raytrace.maths.numerics import detached, value
 from raytrace.maths.result import Column, Result, plain
 from raytrace.optimization.attained import attained_by, columns_of
 from raytrace.optimization.evaluate import MeritResult, evaluate
+from raytrace.plotting.style import Figure
 from raytrace.settings import ON_REQUEST, REPORTS, SECTIONS
 from raytrace.system.lens import Lens, field_points, with_wavelengths
 from raytrace.system.shapes import KINDS
@@ -135,9 +136,10 @@ class _Request:
 
 
 class _Writer:
-    """The blocks of a section while it is written."""
+    """The blocks of a section while it is written; name: of the lens, which the titles of its figures leave out."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.blocks: list[Block] = []
         self.documents: list[dict[str, Any]] = []
         self.gaps: list[str] = []
@@ -146,13 +148,22 @@ class _Writer:
         """A result with its figure and its tables, or the reason why there is none."""
         try:
             result = make()
-            picture = Picture(settled(result.draw()), name, caption)
+            picture = Picture(settled(_without_name(result.draw(), self.name)), name, caption)
             blocks = tables_of(result) if tables else []
         except (RaytraceError, ValueError) as error:
             self.gaps.append(f"{name}: {error}")
             return
         self.blocks += [picture, *blocks]
         self.documents.append(result.document())
+
+
+def _without_name(figure: Figure, name: str) -> Figure:
+    """A figure whose title is what it shows, without the name of the lens, which heads the report."""
+    title = " ".join(figure.get_suptitle().split())
+    shown = title.removeprefix(" ".join(name.split())).strip()
+    if name and shown and shown != title:
+        figure.suptitle(shown[0].upper() + shown[1:], fontweight="bold", fontsize=10)
+    return figure
 
 
 # -- sections
@@ -449,7 +460,7 @@ def _chosen(only: Sequence[str], without: Sequence[str], also: Sequence[str]) ->
 
 def _section(name: str, request: _Request, told: set[str]) -> Section:
     """A section with its warnings; told: warnings of former sections, which are not repeated."""
-    writer = _Writer()
+    writer = _Writer(request.lens.name)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:

@@ -47,6 +47,7 @@ from raytrace.io.zemax.optimization import STATUSES, VARIABLE, TypedSurface, pat
 from raytrace.io.zemax.surfaces import (
     AIMING,
     AIMINGS,
+    FAR,
     GLASS,
     NUMBER,
     ROWS,
@@ -79,9 +80,6 @@ from raytrace.system.surface import Surface
 
 #: More configurations, and more operands, than any file has.
 MOST_CONFIGURATIONS, MOST_CELLS = 200, 2000
-
-#: At this distance an operand has the object at infinity.
-FAR = 1e10
 
 #: The operands of an environment, each with the field of `Environment` that it sets, and those that name its surfaces.
 ENVIRONMENT_OPERANDS = {"TEMP": "temperature", "PRES": "pressure"}

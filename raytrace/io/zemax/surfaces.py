@@ -37,7 +37,9 @@ from raytrace.io.source import (
     double,
     exact,
     is_infinite,
+    is_number,
     nonzero,
+    plain,
     refuse_surplus,
     shown,
     warn_of_repeats,
@@ -156,6 +158,13 @@ FIELDS_IN_LISTS = 12
 #: Ray aiming by the second number of RAIM; a file without RAIM specifies none.
 AIMINGS = ("off", "paraxial", "real")
 
+#: An object at this distance or further away, in the unit of the file, is at infinity.
+FAR = 1e10
+
+#: Keywords of a surface that belong to it without indentation too: neither the system nor the lines behind the surfaces
+#: have them.
+_UNMISTAKABLE = by_word({"surface": "TYPE CURV DISZ GLAS CONI DIAM PARM STOP"})
+
 #: OpticStudio splits a long note into lines of this many characters.
 NOTE_PIECE = 200
 
@@ -209,7 +218,7 @@ def records(text: str, file: str) -> Iterator[Record]:
 def sections(text: str, file: str, report: Draft) -> Sections:
     """The records sorted by the keyword tables, each of them reported.
 
-    A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
+    A surface's records are indented in files of OpticStudio. Where all lines are or none is, the keyword decides.
     The merit function, tolerances and configurations after the last surface are reported by their readers.
     """
     lines, surface_read = list(records(text, file)), {*_SURFACE_READ, *aperture_keywords()}
@@ -220,7 +229,8 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     system = Block(Place(file))
     surfaces: list[Block] = []
     tail: list[Record] = []
-    indents = any(record.indented for record in lines[start:])
+    indents = any(record.indented for record in lines[start:]) and not lines[start - 1].indented
+    without_indent = _UNMISTAKABLE if indents else {*surface_read, *SURFACE_IGNORED}
     block, after_surfaces = system, False
     for record in lines:
         word = record.keyword
@@ -232,7 +242,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
             block, after_surfaces = Block(record.place._replace(surface=len(surfaces))), False
             surfaces.append(block)
             report.met("SURF", READ, block.place)
-        elif block is not system and (record.indented if indents else word in surface_read or word in SURFACE_IGNORED):
+        elif block is not system and ((indents and record.indented) or word in without_indent):
             record = record._replace(place=record.place._replace(surface=block.place.surface))
             _sort(record, block, surface_read, SURFACE_IGNORED, report)
         elif word not in SYSTEM_READ and (after_surfaces or (surfaces and word not in SYSTEM_IGNORED)):
@@ -1010,7 +1020,8 @@ def build(
     if thickness is None:
         raise LensFileError("surface has no DISZ (thickness): file cut off? A plane image has DISZ 0", block.place)
     word = thickness.words[0] if thickness.words else ""
-    if is_infinite(word):
+    is_far = block.place.surface == 0 and is_number(word) and plain(word) >= FAR
+    if is_infinite(word) or is_far:
         if block.place.surface != 0 or word.startswith("-"):
             raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", thickness.place)
         distance = float("inf")

@@ -28,7 +28,6 @@ from raytrace.io.source import (
     thickness,
 )
 from raytrace.io.zemax.configurations import (
-    FAR,
     environment_line,
     power_of,
     with_environments,
@@ -45,6 +44,7 @@ from raytrace.io.zemax.surfaces import (
     AIMING,
     AIMINGS,
     BLANK,
+    FAR,
     FIELD_KINDS,
     FIELD_LISTS,
     FIELDS_IN_LISTS,
@@ -192,7 +192,7 @@ def _surface(lens: Lens, number: int, surface: Surface, width: float, place: Pla
         *(f"  SCBD {side} {_pose(surface, name, place)}" for side, name in posed if getattr(surface, name) is not None),
         f'  CURV {ROWS["CRVT"].write(surface, place)} 0 0 0 0 ""',
         *_numbers(surface, types()[kind], place),
-        f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
+        f"  DISZ {_thickness(surface.thickness, place)}",
         *_glass(surface.glass, place),
         *([] if surface.expansion is None else [f"  TCED {ROWS['TCEX'].write(surface, place)} 0 0"]),
         *([] if surface.conic is None else [f"  CONI {ROWS['CONN'].write(surface, place)}"]),
@@ -202,6 +202,13 @@ def _surface(lens: Lens, number: int, surface: Surface, width: float, place: Pla
         *_apertures(surface.apertures, place, ("surfaces", number, "apertures") in followed),
         *([f"  COMM {comment}"] if comment else []),
     ]
+
+
+def _thickness(number: Tensor, place: Place) -> str:
+    text = thickness(number, "INFINITY", place)
+    if place.surface == 0 and text != "INFINITY" and float(text) >= FAR:
+        raise LensFileError(f"the object is {text} mm away, which OpticStudio takes for infinity; make it inf", place)
+    return text
 
 
 #: Fields of a surface's shape, as an error calls them.

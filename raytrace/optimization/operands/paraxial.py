@@ -41,7 +41,7 @@ def _of_line(number: Callable[[EvaluationContext, Line], Number], line: Line, co
 def _focal_length(context: EvaluationContext, line: Line) -> Number:
     data = context.state.gaussian(line.wavelength)
     in_air = context.planner.conventions.focal_length == "in air"
-    return quotient(-1.0, data.C) if in_air else data.effective_focal_length
+    return data.focal_length_in_air if in_air else data.effective_focal_length
 
 
 def _magnification(state: LensState, wavelength: int) -> Number:
@@ -204,8 +204,8 @@ _OF_STATE: tuple[tuple[str, Callable[[LensState], Number], str, int], ...] = (
     ("OBSN", _object_na, _NA.format("n sin u in front of the lens"), 0),
     (
         "ISFN",
-        lambda state: np.abs(state.gaussian(state.primary).effective_focal_length) / state.entrance_pupil_diameter,
-        "F-number: focal length / entrance pupil diameter",
+        lambda state: np.abs(state.gaussian(state.primary).focal_length_in_air) / state.entrance_pupil_diameter,
+        "F-number: focal length in air / entrance pupil diameter",
         0,
     ),
     ("ENPP", lambda state: state.gaussian(state.primary).entrance_pupil_position, "entrance pupil, from surface 1", 1),
