@@ -620,6 +620,7 @@ def test_the_command_edits_in_order(tmp_path, capsys):
     assert rt.read_lens(out).name == "fifty"
 
 
+@pytest.mark.slow
 def test_the_command_writes_temperatures_that_an_optimisation_makes_athermal(tmp_path, capsys):
     out, better = str(tmp_path / "warm.zmx"), str(tmp_path / "athermal.zmx")
     words = ["--temperatures", "-20", "20", "60", "5=invar", "--mount", "aluminium", "--json", "-o", out]

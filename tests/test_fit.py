@@ -209,6 +209,7 @@ def decoys(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_elements_of_the_lens_are_found_in_their_orientation_and_cost_nothing(designed_singlets, decoys, tmp_path):
     lens = designed_singlets
     part_file(tmp_path, "own-first", element(lens, 1, 2))

@@ -598,6 +598,7 @@ def test_the_response_is_sampled_to_the_tolerance():
     assert float(sampled.primary) == float(lens.primary)
 
 
+@pytest.mark.slow
 def test_outside_the_image_circle_it_is_black():
     """A hole of radius 4 mm, 30 mm before a stop of radius 1 mm, lets light of tan θ < 5/30 pass."""
     hole = {"radius": math.inf, "thickness": 30.0, "apertures": [rt.system.Aperture("circular", (0.0, 4.0))]}
