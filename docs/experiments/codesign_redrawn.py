@@ -89,7 +89,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
             ("paraxial", 0.7, 0),
             *((name, None, 0) for name in ("fourier", "gaussian", "drt")),
         ]
-        drawn = [(name, None, count) for name in ("gaussian", "drt") for count in options.rays]
+        drawn = [("gaussian", None, count) for count in options.rays]
         for model, rho, count in tqdm(plain + drawn, desc=f"F/{f_number:g}", unit="rows", mininterval=5):
             generator = torch.Generator().manual_seed(0)
             models = [model_of(model, rays=disc(count, generator)) for _ in range(options.draws if count else 0)]
@@ -104,8 +104,8 @@ def main() -> None:
     parser.add_argument("lens", metavar="LENS", help="lens file, or the name of a shipped lens")
     parser.add_argument("--data", metavar="DIR", required=True, help="folder of pictures, whose spectrum is taken")
     parser.add_argument("--limit", metavar="N", type=int, help="use N of them, evenly spaced")
-    parser.add_argument("--f-number", metavar="N", type=float, nargs="+", default=[3.0, 2.2, 2.0, 1.92, 1.76])
-    parser.add_argument("--rays", metavar="N", type=int, nargs="+", default=[37, 100, 400], help="of a draw")
+    parser.add_argument("--f-number", metavar="N", type=float, nargs="+", default=[3.0, 2.0])
+    parser.add_argument("--rays", metavar="N", type=int, nargs="+", default=[37, 100], help="of a draw of Gaussian DRT")
     parser.add_argument("--draws", metavar="N", type=int, default=16, help="of the rays (default 16)")
     parser.add_argument("--sensors", metavar="N", type=int, default=25, help="between 15 and 200 m (default 25)")
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True, help="table, .csv")
