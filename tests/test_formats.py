@@ -395,7 +395,7 @@ FEATURES = {
         (featured(apertures=(Aperture("polygon", (-4.0, -4.0, 4.0, -4.0, 0.0, 4.0, -4.0, -4.0)),)), "polygons"),
     ],
     "temperature and pressure": [
-        (dataclasses.replace(featured(), environment=Environment(number(40.0), number(0.5))), "refused"),
+        (dataclasses.replace(featured(), environment=Environment(number(40.0), number(0.5))), "refused|20 °C"),
     ],
 }
 
