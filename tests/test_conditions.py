@@ -239,7 +239,7 @@ def test_an_optimisation_meets_the_conditions_of_the_lens_and_returns_them(tripl
 
 
 def test_conditions_of_the_argument_alone(triplet):
-    """`stored=False` leaves those of the lens, in a descent and a search as in the variables of a camera."""
+    """`stored=False` leaves out the conditions of the lens, in descents, searches and cameras alike."""
     lens = triplet.with_conditions("efl=100 edge>=9")  # elements of 3 to 4 mm
     settings = {"merit": SPOT, "vary": "curvature:1-3 sensor", "hold": "total_track<=115", "stored": False}
     alone = rt.optimize(lens, cycles=4, **settings)

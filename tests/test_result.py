@@ -200,7 +200,7 @@ def test_x_of_fields_is_printed_where_it_is_not_0_under_the_names_of_the_frame()
 
 @pytest.mark.filterwarnings("ignore")
 def test_rounding_errors_are_printed_as_0_and_returned_as_they_are():
-    """A ball with the stop at its centre has no coma; a stop 1e-7 mm beside the centre of a mirror has its own."""
+    """A ball with the stop at its centre has no coma; a stop 1e-7 mm from the centre of a mirror has its own."""
     half = dict(thickness=10.3, glass="N-BK7")
     ball = rt.lens([dict(radius=10.3, **half), half, dict(radius=-10.3, thickness=5)], stop=2,
         entrance_pupil_diameter=4, fields=[0, 13.3], wavelengths=[0.55, 0.48, 0.65])  # fmt: skip

@@ -1,5 +1,5 @@
 """Restored dB of five lenses behind a Wiener filter and behind a small network: the lens of the best spots, that of the
-closed form by steps of second order, and that of Adam, lens and network together.
+closed form by steps of second order, and the lens trained by Adam together with the network.
 
     python docs/experiments/second_order_network.py --data DIR   # runs what the CSV lacks, a lens and seed at a time
     python docs/experiments/second_order_network.py --table      # prints the tables of docs/reference/loss.md

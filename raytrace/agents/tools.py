@@ -98,7 +98,7 @@ class Tool:
         return self.in_parameters(text)
 
     def schema(self, *, in_full: bool = False) -> dict:
-        """The JSON schema of the parameters; in_full: with the full texts of those of `_BRIEF`."""
+        """The JSON schema of the parameters; in_full: with the full texts of the parameters of `_BRIEF`."""
         properties = {name: self._parameter(action, in_full) for name, action in self.actions.items()}
         if self.writes:
             properties["overwrite"] = {"type": "boolean", "description": "replace files that exist, or resume"}
@@ -188,7 +188,7 @@ TOOLS = {
 
 
 def instructions() -> str:
-    """What an agent is told at the start: the conventions, and the full texts of shared parameters."""
+    """Text for the agent at the start: the conventions, and the full texts of shared parameters."""
     spot = TOOLS["spot"]
     return "\n".join([_ABOUT, *(f"- {name}: {spot.in_parameters(OPTIONS[name].help)}" for name in _BRIEF)])
 

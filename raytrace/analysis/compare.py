@@ -189,8 +189,8 @@ class LensComparison(Result):
         }
 
     def roundings(self) -> dict[str, Tensor]:
-        """Those of the analysis, and of the differences by the larger of the values of both lenses: of all rows, or of
-        each one where rows are quantities."""
+        """Roundings of the analysis and of the differences, by the larger of the values of both lenses: of all rows, or
+        of each one where rows are quantities."""
         first, second = self._of_both(brief=self._is_brief)
         known, limits = self.first.roundings(), {}
         for name in (name for name in first if name not in (*_HEADS, *_NO_VALUES)):

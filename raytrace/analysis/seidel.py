@@ -94,7 +94,7 @@ class Seidel(Analysis):
         return {**self.heads(), **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
 
     def roundings(self) -> dict[str, Tensor]:
-        """Those of the sums over the surfaces, and of Ā y = H + A ȳ, which may cancel: S2 = S1 Ā/A has the size of
+        """Roundings of the sums over the surfaces, and of Ā y = H + A ȳ, which may cancel: S2 = S1 Ā/A has the size of
         S1 H/(A y)."""
         yni, H = self.marginal_yni, self.invariant[:, None]
         ratio = torch.where(yni.abs() > rounding(yni), H / yni, 0.0)

@@ -258,7 +258,7 @@ FREEDOM = group(
     "vary",
     Option("bounds", None, "NAME:LOW..HIGH", "of variables: of a kind (thickness:2..15), of one (curvature_3:-0.1..0), "
            "open on one side (sensor:30..)", nargs="+"),
-    Option("hold", None, "NAME=VALUE", "conditions, in addition to those of the lens (default) unless --no-hold is "
+    Option("hold", None, "NAME=VALUE", "conditions, in addition to the lens's own (default) unless --no-hold is "
            "given: efl=50 f_number=4 'total_track<=80' 'distortion<=2%' 'bfd>=30' "
            "image_height=21.6 magnification=-0.5 'thickness:3-5>=20' 'edge>=1' efl@2=100, or an operand as "
            "REAY(8,0,0,1,0,0)=2; off:efl=50 switches one off", nargs="+"),

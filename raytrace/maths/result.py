@@ -64,7 +64,7 @@ COLUMNS = {
 }  # fmt: skip
 SUFFIXES = {"_percent": "%", "_um": "µm"}
 
-#: Rounding of a sum or difference, in units of that of its largest term.
+#: Rounding of a sum or difference, in units of the rounding of its largest term.
 _ROUNDING = 64
 
 #: Rows of a table in a notebook.

@@ -339,8 +339,8 @@ def specified(
     """The merit function of an optimisation, without its conditions, and all conditions, also off ones, in mm.
 
     These are the conditions of the lens, if `stored`, of rows of negative weight of `merit`, and of `hold`, each of
-    which replaces those of the same quantity before it; hold None: without those of the lens. Warns ReplacedCondition.
-    Raises BadHold.
+    which replaces the earlier conditions of the same quantity; hold None: without the conditions of the lens. Warns
+    ReplacedCondition. Raises BadHold.
     """
     function, current = merit_for(lens, merit), lens.current_configuration
     among = [*_of_rows(lens, function.rows, function.unit)]

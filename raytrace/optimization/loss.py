@@ -156,7 +156,7 @@ class LossDescents:
     ):
         self.problem, self.loss = problem, loss
         self.function = FunctionMerit(problem.model, loss, evaluated)
-        self.functions = [self.function]  # and those of the same loss by denser rays
+        self.functions = [self.function]  # and of the same loss by denser rays
         self.settings: dict[str, Any] = {"lower": ends[0], "upper": ends[1], "typical": typical_of(problem.model)}
         self.history: list[Cycle] = []
         self.cycle_limit, self.deadline, self.stopped = 0, np.inf, ""

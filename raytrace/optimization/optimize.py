@@ -99,8 +99,8 @@ def optimize(
     The end is judged by denser rays (`Optimized`), of check_rings rings, by default twice as many.
     vary: variables, or their syntax, as "curvature thickness:5,6" (surfaces 5 and 6), by default the file's; bounds: of
     variables, as "thickness:2..15" (mm); hold: conditions met exactly, as "efl=50 total_track<=80"
-    (`optimization.conditions`), in addition to `lens.conditions` and instead of those of the same quantity; stored:
-    False, or None as `hold`: without those of the lens. The optimised lens has all of them.
+    (`optimization.conditions`), in addition to `lens.conditions` and instead of its conditions of the same
+    quantity; stored: False, or None as `hold`: without the conditions of the lens. The optimised lens has all of them.
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit.
     cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
@@ -337,7 +337,7 @@ def _warn_of_contacts(design: Lens, moved: Lens) -> None:
     changes = ", ".join(f"surface {k} by {after - before:+.3g} mm" for k, before, after in sizes if after != before)
     warnings.warn(
         f"the semi-diameters at which spacers have contact still change after {_CONTACTS} more descents, with the "
-        f"last one: {changes}; the merit is that of the contacts before this change: optimise the lens again",
+        f"last one: {changes}; the merit has the contacts before this change: optimise the lens again",
         NoOptimum, stacklevel=calling_level(),
     )  # fmt: skip
 

@@ -158,7 +158,7 @@ class _Writer:
 
 
 def _without_name(figure: Figure, name: str) -> Figure:
-    """A figure whose title is what it shows, without the name of the lens, which heads the report."""
+    """A figure whose title names its content, without the name of the lens, which heads the report."""
     title = " ".join(figure.get_suptitle().split())
     shown = title.removeprefix(" ".join(name.split())).strip()
     if name and shown and shown != title:
