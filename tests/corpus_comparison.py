@@ -127,6 +127,16 @@ def with_media(lens: Lens, n_primary: list[float]) -> Lens:
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
+def index_of_focal_length(paraxial: dict) -> float:
+    """F/# by the focal length in air over F/# by that in the medium of the image, both of the oracle.
+
+    The oracle divides the latter by the entrance pupil. OpticStudio takes the former: semi-diameters that it stored for
+    an image in glass, in test_paraxial.
+    """
+    focal_length = paraxial["efl"]
+    return abs(focal_length["efl_air"] / focal_length["own"]) if "efl_air" in focal_length else 1.0
+
+
 def compare_first_order(lens: Lens, entry: dict, result: Comparison) -> list[str]:
     """(b) First-order data with the media of the oracle, relative to the larger of the number and the focal length."""
     data = first_order(with_media(lens, entry["n_primary"]))
@@ -137,6 +147,8 @@ def compare_first_order(lens: Lens, entry: dict, result: Comparison) -> list[str
         if not isinstance(expected, dict) or not expected["oracle"] or expected["own"] is None:
             continue
         theirs = expected["own"] * (1.0 if key in PURE_NUMBERS else unit)
+        if key == "fno":
+            theirs *= index_of_focal_length(entry["paraxial_at_own_index"])
         ours = getattr(data, name).item()
         size = max(abs(theirs), 1e-30 if key in PURE_NUMBERS else 1.0)  # 1 mm: a position may be 0
         difference = abs(ours - theirs) / size
