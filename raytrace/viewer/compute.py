@@ -49,7 +49,8 @@ def curves(values: Tensor) -> list:
     numbers = style.array(values)
     finite = np.isfinite(numbers)
     largest = np.abs(numbers[finite]).max(initial=0.0)
-    rounded = numbers.round(5 - math.floor(math.log10(largest)) if largest > 0 else 0).tolist()
+    exponent = math.floor(math.log10(1.000001 * largest)) if largest > 0 else 0  # of 1 and of 1 - 1e-16 alike
+    rounded = numbers.round(5 - exponent).tolist()
     return rounded if finite.all() else plain(rounded)
 
 
