@@ -59,12 +59,12 @@ SCENES = {"16 to 48 m": (16e3, 48e3), "24 m": (24e3, 24e3)}
 #: Places along +y of the sensor, relative to half of its diagonal.
 FIELDS = {"axis": (0.0,), "field": (0.0, 0.7, 1.0)}
 CORRELATIONS = ("0", "0.9", "0.97")
-#: Groups of runs, in this order: fields, scene, criteria; synthetic spectra for the first seed alone.
+#: Groups of runs, in this order: fields, scene, criteria, seeds.
 RUNS = (
-    ("axis", "16 to 48 m", ("apart", "joint")),
-    ("axis", "16 to 48 m", CORRELATIONS),
-    ("field", "16 to 48 m", ("apart", "joint")),
-    ("axis", "24 m", ("apart", "joint")),
+    ("axis", "16 to 48 m", ("apart", "joint"), 5),
+    ("axis", "24 m", ("apart", "joint"), 5),
+    ("axis", "16 to 48 m", CORRELATIONS, 1),
+    ("field", "16 to 48 m", ("apart", "joint"), 3),
 )
 BANDS = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5)  # of frequency, 1/pixel
 
@@ -325,7 +325,7 @@ def comparisons(found: dict[tuple, dict], names: list[str]) -> list[dict]:
     """
     rows = []
     for name in names:
-        for fields, scene, criterion in ((*group, one) for *group, criteria in RUNS for one in criteria[1:]):
+        for fields, scene, criterion in ((*group, one) for *group, criteria, _ in RUNS for one in criteria[1:]):
             before = "apart" if criterion == "joint" else "0"
             keys = [(fields, scene, one) for one in (before, criterion)]
             seeds = sorted(seed for n, *key, seed in found if n == name and tuple(key) == keys[1])
@@ -430,7 +430,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", required=True, help="folder of colour pictures")
     parser.add_argument("-o", dest="folder", type=Path, required=True, help="folder of the results")
     parser.add_argument("--docs", type=Path, help="folder of documentation, for the table and the figure")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=5, help="of a group, at most")
     parser.add_argument("--cycles", type=int, default=60, help="of a descent, at most")
     parser.add_argument("--groups", type=int, default=len(RUNS), help="the first groups of runs alone")
 
@@ -450,8 +450,8 @@ def main(words: list[str] | None = None) -> None:
         write_json(stored, {"rows": specified("double_gauss", pictures)})
     given, found = read_json(stored)["rows"], {}
     print(table_specified(given), flush=True)
-    for fields, scene, criteria in RUNS[: chosen.groups]:
-        for name, seed in itertools.product(chosen.lenses, range(1 if criteria == CORRELATIONS else chosen.seeds)):
+    for fields, scene, criteria, seeds in RUNS[: chosen.groups]:
+        for name, seed in itertools.product(chosen.lenses, range(min(seeds, chosen.seeds))):
             for criterion in criteria:
                 found[name, fields, scene, criterion, seed] = run(
                     name, fields, scene, criterion, seed, pictures, chosen.folder, chosen.cycles
