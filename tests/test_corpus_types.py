@@ -251,7 +251,7 @@ def test_the_definitions_of_the_tests_are_those_of_the_oracle(name):
 
 _PAGE = """# Corpus of real lens files
 
-{right} of {count} real `.zmx` files are read and agree with independent figures; {refused} is refused by
+{right} of {count} comparisons of {files} real `.zmx` files agree with independent figures; {refused} is refused by
 name and line, {wrong} is wrong.
 
     python tests/test_corpus_types.py docs
@@ -327,7 +327,8 @@ def document(rows: list[dict[str, str]]) -> str:
     }
     refusals = [f"- `{r['file']}`: {r['details'].partition('; ')[0]}" for r in rows if r["outcome"] != RIGHT]
     return _PAGE.format(
-        count=len(rows), right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
+        count=len(rows), files=len({row["file"] for row in rows}),
+        right=outcomes[RIGHT], refused=outcomes[REFUSED] or "none", wrong=outcomes[WRONG] or "none",
         types=", ".join(f"`{kind}`" for kind in types() if kind not in SETTLED), table=by_type(),
         refusals="\n".join(refusals) or "None.",
         **largest,
