@@ -161,7 +161,11 @@ def zemax() -> list[str]:
                 ["EFFL", "TRAC", "…"],
                 "[Operands](operands.md); unknown ones are kept and reported",
             ),
-            row_of("kept and written", ["TOL", "TCMM"], "tolerances; not evaluated"),
+            row_of(
+                "read and written",
+                ["TOL", "TCMM"],
+                "tolerances, evaluated by `rt.tolerance`; unknown lines are kept and reported",
+            ),
         ),
     ]
 

@@ -74,7 +74,7 @@ def test_pages_state_the_counts_of_the_cases():
             "docs/reference/accuracy.md",
             f"{total} figures of OpticStudio: {agree} agree to the digits printed, {theirs} ",
         ),
-        ("README.md", f"of {total} figures that it printed, {agree} agree"),
+        ("README.md", f"of {total} figures that it printed or stored, {agree} agree"),
     ):
         assert words in (root / page).read_text("utf-8"), page
     table = (root / "docs" / "reference" / "opticstudio.md").read_text("utf-8")
