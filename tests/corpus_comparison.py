@@ -128,10 +128,10 @@ def with_media(lens: Lens, n_primary: list[float]) -> Lens:
 
 
 def index_of_focal_length(paraxial: dict) -> float:
-    """F/# by the focal length in air over F/# by that in the medium of the image, both of the oracle.
+    """Focal length in air over focal length in the medium of the image, both of the oracle.
 
-    The oracle divides the latter by the entrance pupil. OpticStudio takes the former: semi-diameters that it stored for
-    an image in glass, in test_paraxial.
+    The oracle's F/# is the latter over the entrance pupil diameter, OpticStudio's the former: test_paraxial has
+    semi-diameters that OpticStudio stored for an image in glass.
     """
     focal_length = paraxial["efl"]
     return abs(focal_length["efl_air"] / focal_length["own"]) if "efl_air" in focal_length else 1.0

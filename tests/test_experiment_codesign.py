@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import itertools
+import json
 import math
 
 import pytest
@@ -467,3 +468,20 @@ def test_only_the_papers_lens_has_its_claims():
     paths = sorted(shipped("lenses").glob("*.zmx"))
     assert [path.stem for path in paths if is_of_paper(read_lens(path))] == ["double_gauss"]
     assert is_of_paper(with_sensor_distance(read_lens(shipped("lenses") / "double_gauss.zmx"), 57.0))
+
+
+def test_a_table_of_finished_runs_is_read_back(tmp_path):
+    """By model and seed, from several studies; an unfinished run has no row."""
+    numbers = dict.fromkeys(("l1_joint", "l1_before", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm"), 0.1)
+    for study, model, seed in (("b", "gaussian", 0), ("a", "paraxial", 1), ("b", "paraxial", 0)):
+        folder = tmp_path / study / f"{model}-{seed}"
+        folder.mkdir(parents=True)
+        run = {"model": model, "seed": seed, **numbers, "by_distance": {"10000": 0.07, "12500": seed}, "penalty": 0.0}
+        (folder / "outcome.json").write_text(json.dumps(run), "utf-8")
+    (tmp_path / "a" / "fourier-0").mkdir()
+    rows = judged.table_of([tmp_path / "a", tmp_path / "b"])
+    assert [(row["model"], row["seed"]) for row in rows] == [("paraxial", 0), ("paraxial", 1), ("gaussian", 0)]
+    write_table(tmp_path / "table.csv", rows)
+    runs = judged.outcomes_of(tmp_path / "table.csv")
+    assert [run.by_distance for run in runs] == [{"10000": 0.07, "12500": float(row["l1_12.5m"])} for row in rows]
+    assert all(run.l1_drt == run.sensor_mm == 0.1 for run in runs)

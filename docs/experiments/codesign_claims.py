@@ -1,6 +1,7 @@
 """The claims of the published study of the double Gauss, compared with finished runs.
 
     python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2   # claims.csv of a table.csv
+    python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2 --runs FOLDER   # and table.csv of runs
 
 A claim is a row (text, criterion, function that judges it). A table.csv has a row for each model and seed: losses, foci
 and sensor distance, and the loss after step 2 at every object distance. It says nothing about the course of training
@@ -10,6 +11,7 @@ and about times, whose claims are left unanswered.
 import argparse
 import csv
 import dataclasses
+import json
 import math
 import re
 import statistics
@@ -371,13 +373,25 @@ def blur_of(runs: Sequence[Outcome], f_number: float) -> Measurements:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of table.csv; claims.csv is written there")
+    parser.add_argument("--runs", metavar="STUDY", type=Path, nargs="+", help="folders of codesign.py, for table.csv")
     parser.add_argument("--f-number", metavar="N", type=float, required=True, help="aperture of the runs")
+
+
+def table_of(studies: Sequence[Path]) -> list[dict]:
+    """Rows of table.csv: the finished runs of studies by codesign.py, by model and seed; lengths in mm, foci in m."""
+    runs = [json.loads(file.read_text("utf-8")) for study in studies for file in study.glob("*/outcome.json")]
+    names = ("model", "seed", "l1_joint", "l1_before", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
+    runs.sort(key=lambda run: ([*NAMES].index(run["model"]), run["seed"]))
+    by_distance = [{f"l1_{float(at) / 1e3:g}m": loss for at, loss in run["by_distance"].items()} for run in runs]
+    return [{name: run[name] for name in names} | losses for run, losses in zip(runs, by_distance, strict=True)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options(parser)
     arguments = parser.parse_args()
+    if arguments.runs:
+        write_table(arguments.folder / "table.csv", table_of(arguments.runs))
     runs = outcomes_of(arguments.folder / "table.csv")
     judged = claims(runs, [], blur_of(runs, arguments.f_number), pending=())
     rows = [
