@@ -450,7 +450,7 @@ def figure(rows: list[dict], given: list[dict]):
 
 
 def lines_of(found: dict[tuple, dict]) -> list[dict]:
-    """Rows of the CSV file: a lens, its axial colour and its errors."""
+    """Rows of the CSV file: a lens, its axial colour and errors, and the end of each descent, in closed form."""
     rows = []
     for (name, fields, scene, criterion, seed), one in found.items():
         row = {"lens": name, "fields": fields, "scene": scene, "criterion": criterion, "seed": seed}
@@ -458,7 +458,11 @@ def lines_of(found: dict[tuple, dict]) -> list[dict]:
         of = {f"mse_{name}": error_of(one, name) for name in one["errors"]} if "errors" in one else {}
         of |= {f"mse_correlation_{name}": error for name, error in one.get("drt", {}).items()}
         names = ("mse_apart", "mse_joint", *(f"mse_correlation_{r}" for r in CORRELATIONS))
-        rows.append({**row, **{name: of.get(name, "") for name in names}})
+        row |= {name: of.get(name, "") for name in names}
+        for start in ("file", "colour", "other"):
+            value, colour = one["starts"].get(start, ("", ""))
+            row |= {f"mse_from_{start}": value and 1e-3 * value, f"axial_colour_from_{start}_mm": colour}
+        rows.append(row)
     return rows
 
 
