@@ -216,7 +216,8 @@ def _with_errors(formula: Formula, coefficients: Tensor, wavelength: Tensor) -> 
     """n + Δn + M(n_d, V_d + ΔV_d, ΔP_gF) - M(n_d, V_d, ΔP_gF), M the model glass."""
     n = formula.index(coefficients[:-_ERRORS], wavelength)
     change, nd, vd, abbe_change, dpgf = coefficients[-_ERRORS:].unbind(0)
-    changed, nominal = (_model(torch.stack([nd, v, dpgf]), wavelength) for v in (vd + abbe_change, vd))
+    abbe = torch.stack([vd + abbe_change, vd])
+    changed, nominal = _model(torch.stack([nd.expand_as(abbe), abbe, dpgf.expand_as(abbe)]), wavelength).unbind(0)
     return torch.where(n > 0, n + change + (changed - nominal), n)
 
 

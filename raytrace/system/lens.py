@@ -897,17 +897,18 @@ def _refractive_indices(glasses: Sequence[Glass], wavelength: Tensor) -> list[Te
     """`refractive_index` of each glass; glasses of one formula are evaluated together."""
     groups: dict[object, list[int]] = {}
     for number, glass in enumerate(glasses):
-        together = glass.formula not in ("mirror", "constant") and glass.coefficients.dim() == 1
-        groups.setdefault((glass.formula, len(glass.coefficients)) if together else number, []).append(number)
+        together = glass.formula not in ("mirror", "constant")
+        groups.setdefault((glass.formula, glass.coefficients.shape) if together else number, []).append(number)
     indices: dict[int, Tensor] = {}
     for numbers in groups.values():
         if len(numbers) == 1:
             indices[numbers[0]] = refractive_index(glasses[numbers[0]], wavelength)
             continue
-        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
-        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], 1)
+        count, size, *batch = stacked.shape
+        stacked = stacked.reshape(count, size, *(1,) * (wavelength.dim() - len(batch)), *batch)
         group = dataclasses.replace(glasses[numbers[0]], coefficients=stacked)
-        indices |= dict(zip(numbers, refractive_index(group, wavelength[None]).unbind(0), strict=True))
+        indices |= dict(zip(numbers, refractive_index(group, wavelength).unbind(0), strict=True))
     return [indices[number] for number in range(len(glasses))]
 
 
