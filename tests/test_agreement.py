@@ -572,6 +572,16 @@ def test_derivatives_of_the_focus_of_a_clipped_lens():
     assert float(second) == pytest.approx(float(ahead + behind - 2 * middle.detach()) / step**2, rel=1e-5)
 
 
+def test_focal_lengths_of_an_image_in_glass():
+    """`info` prints the focal length in air, of which the F/# is, beside that of the image space."""
+    lens = _in_glass()
+    text, data = str(rt.info(lens)), rt.first_order(lens)
+    in_air = float(text.split("; focal length in air ")[1].split(" mm")[0])
+    assert in_air == pytest.approx(float(data.f_number * data.entrance_pupil_diameter), rel=1e-8)
+    assert in_air == pytest.approx(float(data.effective_focal_length) / GLASS, rel=1e-8)
+    assert "image space" not in str(rt.info(_triplet()))  # in air they are one
+
+
 @quiet
 def test_first_order_data(lens):
     """Focal length, F-number and magnification: first-order data, operands, and the report of the lens."""

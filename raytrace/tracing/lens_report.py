@@ -232,7 +232,7 @@ class Info(Result):
         return [(words, tangential, sagittal, unit) for words, (tangential, sagittal), unit in pairs]
 
     def scene(self) -> list[tuple[str, str]]:
-        """Wavelengths, fields, ray aiming, configuration and environment: quantity and text."""
+        """Wavelengths, fields, ray aiming, configuration, image medium and environment: quantity and text."""
         lens = detached(self.lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several, which, spaces = len(lens.wavelengths) > 1, _configuration(lens), first_order(lens).telecentric_spaces
@@ -248,6 +248,7 @@ class Info(Result):
             ("ray aiming", aiming),
             *([("configuration", " of ".join(map(str, which.values())))] if which else []),
             ("fields", f"{points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}"),
+            *([("image space", medium)] if (medium := _image_medium(lens)) else []),
             *([("environment", environment_in_words(lens.environment))] if lens.environment else []),
         ]
 
@@ -309,6 +310,14 @@ def _environment(holder: Lens | Surface) -> dict:
     if not place:
         return {}
     return {"environment": {"temperature": number(place.temperature), "pressure": number(place.pressure)}}
+
+
+def _image_medium(lens: Lens) -> str:
+    """The index of the image space and the focal length in air, of which the F/# is; "" for an image in air."""
+    index, power = float(media(lens, lens.primary)[-1]), float(first_order(lens).power)
+    if index == 1 or not math.isfinite(power) or power == 0:
+        return ""
+    return f"n' = {index:.6g}; focal length in air {1 / power:.9g} mm"
 
 
 def _indices(lens: Lens) -> list[float]:
