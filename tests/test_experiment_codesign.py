@@ -485,3 +485,9 @@ def test_a_table_of_finished_runs_is_read_back(tmp_path):
     runs = judged.outcomes_of(tmp_path / "table.csv")
     assert [run.by_distance for run in runs] == [{"10000": 0.07, "12500": float(row["l1_12.5m"])} for row in rows]
     assert all(run.l1_drt == run.sensor_mm == 0.1 for run in runs)
+    earlier = [{**row, "l1_drt": "0.2"} for row in judged.rows_of(tmp_path / "table.csv")]
+    joined = judged.table_of([tmp_path / "a"], earlier)  # further runs replace rows of their model and seed alone
+    assert [(row["model"], float(row["l1_drt"])) for row in joined] == [
+        ("paraxial", 0.2), ("paraxial", 0.1), ("gaussian", 0.2),
+    ]  # fmt: skip
+    assert judged.rows_of(tmp_path / "a" / "table.csv") == []

@@ -1,7 +1,7 @@
 """The claims of the published study of the double Gauss, compared with finished runs.
 
     python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2   # claims.csv of a table.csv
-    python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2 --runs FOLDER   # and table.csv of runs
+    python docs/experiments/codesign_claims.py docs/codesign_f2_x2 --f-number 2 --runs FOLDER   # with further runs
 
 A claim is a row (text, criterion, function that judges it). A table.csv has a row for each model and seed: losses, foci
 and sensor distance, and the loss after step 2 at every object distance. It says nothing about the course of training
@@ -347,12 +347,18 @@ CLAIMS = (
 # -- of a table
 
 
+def rows_of(path: Path) -> list[dict]:
+    """The rows of a table.csv; none where there is no file."""
+    if not path.exists():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
 def outcomes_of(path: Path) -> list[StudyOutcome]:
     """The runs of a table.csv."""
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
     runs = []
-    for row in rows:
+    for row in rows_of(path):
         numbers = {key: float(value) for key, value in row.items() if key not in ("model", "seed")}
         at = {key: float(found[1]) * 1e3 for key in numbers if (found := re.fullmatch(r"l1_([\d.]+)m", key))}
         by_distance = {f"{z:g}": numbers.pop(key) for key, z in at.items()}
@@ -373,26 +379,31 @@ def blur_of(runs: Sequence[Outcome], f_number: float) -> Measurements:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of table.csv; claims.csv is written there")
-    parser.add_argument("--runs", metavar="STUDY", type=Path, nargs="+", help="folders of codesign.py, for table.csv")
+    parser.add_argument("--runs", metavar="STUDY", type=Path, nargs="+", help="folders of codesign.py, whose runs join table.csv")
     parser.add_argument("--f-number", metavar="N", type=float, required=True, help="aperture of the runs")
 
 
-def table_of(studies: Sequence[Path]) -> list[dict]:
-    """Rows of table.csv: the finished runs of studies by codesign.py, by model and seed; lengths in mm, foci in m."""
-    runs = [json.loads(file.read_text("utf-8")) for study in studies for file in study.glob("*/outcome.json")]
+def table_of(studies: Sequence[Path], earlier: Sequence[Mapping] = ()) -> list[dict]:
+    """Rows of table.csv, by model and seed: the finished runs of studies by codesign.py, and earlier rows that none of
+    them replaces; lengths in mm, foci in m."""
     names = ("model", "seed", "l1_joint", "l1_before", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
-    runs.sort(key=lambda run: ([*NAMES].index(run["model"]), run["seed"]))
-    by_distance = [{f"l1_{float(at) / 1e3:g}m": loss for at, loss in run["by_distance"].items()} for run in runs]
-    return [{name: run[name] for name in names} | losses for run, losses in zip(runs, by_distance, strict=True)]
+    of = {(row["model"], int(row["seed"])): dict(row) for row in earlier}
+    for file in (file for study in studies for file in study.glob("*/outcome.json")):
+        run = json.loads(file.read_text("utf-8"))
+        losses = {f"l1_{float(at) / 1e3:g}m": loss for at, loss in run["by_distance"].items()}
+        of[run["model"], run["seed"]] = {name: run[name] for name in names} | losses
+    return [of[key] for key in sorted(of, key=lambda key: ([*NAMES].index(key[0]), key[1]))]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options(parser)
     arguments = parser.parse_args()
+    table = arguments.folder / "table.csv"
     if arguments.runs:
-        write_table(arguments.folder / "table.csv", table_of(arguments.runs))
-    runs = outcomes_of(arguments.folder / "table.csv")
+        write_table(table, table_of(arguments.runs, rows_of(table)))
+    if not (runs := outcomes_of(table)):
+        raise SystemExit(f"{table}: no finished runs; give --runs FOLDER, the -o of codesign.py")
     judged = claims(runs, [], blur_of(runs, arguments.f_number), pending=())
     rows = [
         {"claim": one.text, "answer": one.answer, "figures": one.figures, "criterion": one.criterion} for one in judged
