@@ -379,7 +379,7 @@ def blur_of(runs: Sequence[Outcome], f_number: float) -> Measurements:
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of table.csv; claims.csv is written there")
-    parser.add_argument("--runs", metavar="STUDY", type=Path, nargs="+", help="folders of codesign.py, to join table.csv")
+    parser.add_argument("--runs", metavar="STUDY", type=Path, nargs="+", help="folders of codesign.py, for table.csv")
     parser.add_argument("--f-number", metavar="N", type=float, required=True, help="aperture of the runs")
 
 
