@@ -290,7 +290,7 @@ ERRORS = {
     "RefusedFile": "agents.folder",
     "ReplacedCondition": "optimization.conditions",
     "TakesLong": "budget",
-    "TooCoarse": "wave_optics.hybrid",
+    "TooCoarse": "wave_optics.direction_grid",
     "TooManyPoints": "psf_models.dft",
     "Unbuildable": "tracing.geometry",
     "UnfilledStop": "tracing.launch",

@@ -160,8 +160,8 @@ from raytrace.tracing.ray_listing import trace as trace
 from raytrace.tracing.spot import EmptySpot as EmptySpot
 from raytrace.tracing.trace import Bent as Bent
 from raytrace.viewer.widget import view as view
+from raytrace.wave_optics.direction_grid import TooCoarse as TooCoarse
 from raytrace.wave_optics.height_maps import HeightMapError as HeightMapError
-from raytrace.wave_optics.hybrid import TooCoarse as TooCoarse
 from raytrace.wave_optics.plan import AliasedSampling as AliasedSampling
 from raytrace.words import MissingExtra as MissingExtra
 from raytrace.words import RaytraceError as RaytraceError

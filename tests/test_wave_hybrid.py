@@ -12,6 +12,7 @@ from raytrace.materials.glass import constant
 from raytrace.maths.sampling import centres, gauss_rings, grid
 from raytrace.psf_models import DRT, psf, wave
 from raytrace.system import sag_terms as sag_terms
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, aligned, media, with_sensor_distance
 from raytrace.system.surface import sag_at
 from raytrace.tracing.launch import launch
@@ -424,10 +425,101 @@ def test_derivatives_by_heights_and_by_the_lens():
     assert gradcheck(computed, inputs, eps=1e-8, atol=1e-3, rtol=1e-4)
 
 
-def test_pixels_too_fine_for_rays_are_refused():
+def plate(count: int, depth: float = 4e-4, *, seed: int = 0) -> Element:
+    """Random heights of up to `depth` mm in pixels, `count` of them across 4 mm."""
+    heights = depth * torch.rand(count, count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return Element(Pixels(heights, scalar(4.0 / count)), scalar(2.0), constant(INDEX))
+
+
+@pytest.mark.parametrize("y", [0.0, 10.0])
+def test_pixels_agree_with_a_sum_over_many_rays(monkeypatch, y):
+    """Random heights of a third of a wave on the grid of directions, against ten times as many rays as usual."""
+    view, element = view_of(slow_gauss(), y), plate(12)
+    pixels = window(view)
+    result = bridge.kernels(view, (element,), pixels)
+    monkeypatch.setattr(bridge, "_directions", lambda *_: None)
+    monkeypatch.setattr(bridge, "_PER_PIXEL", 100.0)
+    of_rays = bridge.kernels(view, (element,), pixels)
+    assert of_rays.rays > 50_000
+    assert float((result.kernel - of_rays.kernel).abs().sum() / of_rays.energy) < 1e-3
+    assert float(abs(result.energy / of_rays.energy - 1)) < 4e-4
+
+
+def test_pixels_converge_with_the_order():
+    """Of two plates in contact with a smooth element four cells to a pixel leave 1e-3 of the light."""
+    view, elements = view_of(slow_gauss(), 10.0), (plate(60), plate(45, seed=1), noll(0.0, 0.0, 0.0, 2e-4))
+    pixels = window(view)
+    fine = bridge.kernels(view, elements, pixels, order=5).kernel
+    for order, bound in ((-2, 3e-2), (0, 2e-3), (2, 1e-3)):
+        coarse = bridge.kernels(view, elements, pixels, order=order).kernel
+        assert float((coarse - fine).abs().sum() / fine.sum()) < bound, order
+
+
+def test_derivatives_by_flat_heights_know_every_pixel():
+    """Heights of 0, where a design begins, have no steps that a choice of rays could see."""
+    view, heights = view_of(slow_gauss()), torch.zeros(60, 60, dtype=torch.float64)
+    pixels, gradients = window(view), []
+    for order in (0, 2):
+        numbers = heights.clone().requires_grad_()
+        element = Element(Pixels(numbers, scalar(4.0 / 60)), scalar(2.0), constant(INDEX))
+        kernel = bridge.kernels(view, (element,), pixels, order=order).kernel
+        (slope,) = torch.autograd.grad(kernel.square().sum() / kernel.detach().square().sum(), numbers)
+        gradients.append(slope)
+    inside = torch.hypot(*torch.meshgrid(*[torch.arange(60) - 29.5] * 2, indexing="ij")) < 25
+    assert bool((gradients[0][inside] != 0).all())
+    assert float((gradients[0] - gradients[1]).abs().max() / gradients[1].abs().max()) < 5e-3
+
+
+def test_derivatives_of_pixels_by_the_lens():
+    """By a curvature and a factor of all heights, first and second, of kernels at two distances off the axis."""
+    lens_of, heights = slow_gauss(), plate(40).profile.heights.clone()
+
+    def computed(change: torch.Tensor) -> torch.Tensor:
+        surfaces = list(lens_of.surfaces)
+        surfaces[2] = dataclasses.replace(surfaces[2], curvature=surfaces[2].curvature * (1 + change[0]))
+        system = dataclasses.replace(lens_of, surfaces=tuple(surfaces))
+        profile = Pixels(heights * (1 + change[1]), scalar(0.1))
+        view = scene(system, vector(0.0, 8.0)[:, None], vector(25e3, 60e3), system.wavelengths)
+        element = Element(profile, scalar(2.0), constant(INDEX))
+        return (1e3 * bridge.kernels(view, (element,), grid(scalar(0.004), 5, chief), order=-2).kernel).square().sum()
+
+    chief = vector(0.0, 8.0)
+    chief[1] = float(window(view_of(lens_of, 8.0)).centre.flatten()[1])
+    at, step = vector(0.0, 0.0).requires_grad_(), 1e-6
+    (slope,) = torch.autograd.grad(computed(at), at, create_graph=True)
+    second = [torch.autograd.grad(part, at, retain_graph=True)[0] for part in slope]
+    for number in range(2):
+        moved = [at.detach().clone() for _ in range(2)]
+        moved[0][number] += step
+        moved[1][number] -= step
+        slopes, values = [], []
+        for place in moved:
+            place.requires_grad_()
+            values.append(computed(place))
+            slopes.append(torch.autograd.grad(values[-1], place)[0])
+        difference = float((values[0] - values[1]).detach()) / (2 * step)
+        assert float(slope[number].detach()) == pytest.approx(difference, rel=1e-5)
+        assert second[number].tolist() == pytest.approx(((slopes[0] - slopes[1]) / (2 * step)).tolist(), rel=1e-3)
+
+
+def test_pixels_in_a_clipped_beam_are_summed_over_rays():
+    system = slow_gauss()
+    surfaces = list(system.surfaces)
+    surfaces[1] = dataclasses.replace(surfaces[1], apertures=(Aperture("circular", (0.0, 1.5)),))
+    view = view_of(dataclasses.replace(system, surfaces=tuple(surfaces)))
+    assert bridge._directions(view, wave.probe_of(view)) is None
+    assert bridge._directions(view_of(system), wave.probe_of(view_of(system))) is not None
+    result = bridge.kernels(view, (plate(12, 0.0),), window(view), order=1)
+    expected = wave.kernels(view, window(view), order=1).kernel
+    assert float((result.kernel - expected).abs().max()) < 2e-7 * float(expected.max())
+
+
+def test_elements_too_fine_are_refused():
     fine = Element(Pixels(torch.rand(1356, 1356, dtype=torch.float64), scalar(0.00369)), RADIUS, constant(1.5))
-    with pytest.raises(bridge.TooCoarse, match="wave camera"):
-        bridge.kernels(view_of(slow_gauss()), (fine,), grid(scalar(0.005), 3))
+    rings = Element(Rings(torch.rand(4000, dtype=torch.float64), scalar(0.00063)), RADIUS, constant(1.5))
+    for element, order, counted in ((fine, 2, "directions, more than 4,096"), (rings, 0, "rays, more than 400000")):
+        with pytest.raises(bridge.TooCoarse, match=rf"{counted}.* wave camera"):
+            bridge.kernels(view_of(slow_gauss()), (element,), grid(scalar(0.005), 3), order=order)
 
 
 def test_elements_smaller_than_the_beam_and_stops_in_glass_are_refused():

@@ -1,4 +1,4 @@
-"""Processor time of training steps of cameras: python bench_steps.py [clipped] [built] [element]
+"""Processor time of training steps of cameras: python bench_steps.py [clipped] [built] [element] [stop]
 
 clipped: eight colour patches at eight places and object distances, forward and backward by curvatures and thicknesses,
 through a lens without rims and with rims at its semi-diameters, or a share of them, in turns.
@@ -6,6 +6,7 @@ built: kernels of perturbed lenses, each at its own place and object distance, t
 best focus of each lens.
 element: kernels of a height map of 200 × 200 pixels without a lens at four object distances, forward and backward by
 all heights.
+stop: the same at the stop of the double Gauss, by `rt.wave_optics.hybrid_psf`.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from torch import Tensor
 
 import raytrace as rt
 from raytrace.system.apertures import Aperture
+from raytrace.tracing.launch import stop_radius
 
 REPEATS = 3
 PATCHES, SIDE, WINDOW = 8, 128, 51
@@ -136,7 +138,25 @@ def element() -> None:
     print(f"{side} × {side} heights, {camera._sampling}: {1e3 * medians({'step': step})['step']:.0f} ms", flush=True)
 
 
-PARTS = {"clipped": clipped, "built": built, "element": element}
+def stop() -> None:
+    lens, side = rt.focus(rt.read_lens("double_gauss")).lens.at(wavelengths=[0.55]), 200
+    aperture = 2.1 * float(stop_radius(lens))
+    heights = 2e-4 * torch.rand(side, side, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    heights.requires_grad_()
+
+    def step():
+        plate = rt.element(heights, aperture=aperture, glass=1.5, pitch=1.02 * aperture / side)
+        found = rt.wave_optics.hybrid_psf(lens, plate, fields=[0.0], object_distances=[1e4, 2e4, 4e4, 1e5])
+        found.kernel.square().sum().backward()
+        return found
+
+    rays = int(step().rays)
+    print(
+        f"{side} × {side} heights at the stop, {rays} rays: {1e3 * medians({'step': step})['step']:.0f} ms", flush=True
+    )
+
+
+PARTS = {"clipped": clipped, "built": built, "element": element, "stop": stop}
 
 
 def options(parser: argparse.ArgumentParser) -> None:

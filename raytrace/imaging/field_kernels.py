@@ -49,6 +49,7 @@ from raytrace.tracing.scene import Memo, scene, trace_scene
 from raytrace.wave_optics import hybrid
 from raytrace.wave_optics.compute import psf as wave_psf
 from raytrace.wave_optics.compute import psf_by_depth
+from raytrace.wave_optics.direction_grid import TooCoarse
 from raytrace.wave_optics.element import Element, is_radial
 from raytrace.wave_optics.hybrid import is_stop_alone
 from raytrace.wave_optics.plan import Plan
@@ -738,7 +739,7 @@ def _order_of_elements(
         try:
             parts = (dataclasses.replace(kernels, object_distances=distance) for distance in distances.split(1))
             light = torch.cat([part.of_fields(fields) for part in parts], 1)
-        except hybrid.TooCoarse:
+        except TooCoarse:
             if before is None:
                 raise
             break

@@ -97,7 +97,7 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
     (P,) or (..., P), not negative, 1 by default.
     Raises ValueError if a fit has fewer points of positive weight than coefficients.
     """
-    weights = torch.ones_like(values) if weights is None else weights.expand(values.shape)
+    weights = values.new_ones(values.shape[-1:]) if weights is None else weights
     refuse_few(int((weights > 0).sum(-1).min()), len(basis))
     root = torch.sqrt(torch.where(weights > 0, weights, 1.0))
     root = torch.where(weights > 0, root, 0.0)

@@ -94,6 +94,11 @@ def waves(scene: Scene, reach: Tensor | float, *, order: int = 0, probe: Wavefro
     return Waves(safe_sqrt(front.energy * solid), front, fold)
 
 
+def density_of_light(probe: Wavefront, pupil: Tensor, weights: Tensor) -> Tensor:
+    """1/Ω (..., P): times the energy of rays of pupil points and weights, the light of a unit of directions (L, M)."""
+    return 1 / (math.pi * weights * _jacobian(_direction_map(probe), pupil))
+
+
 def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
     """U (D, F, W, Y, X) in 1/mm at x (..., X), y (..., Y) mm from the chief ray's point, by a matrix DFT."""
     front = waves.wavefront
@@ -142,7 +147,10 @@ class SensorPoints:
 
     def integrated(self, light: Waves, probe: Wavefront) -> tuple[Tensor, Tensor, Tensor]:
         """Kernel, and centroid and covariance of the light inside the window."""
-        U = amplitude(light, self.x, self.y)
+        return self.integrated_amplitude(amplitude(light, self.x, self.y), probe)
+
+    def integrated_amplitude(self, U: Tensor, probe: Wavefront) -> tuple[Tensor, Tensor, Tensor]:
+        """`integrated` of the amplitude (D, F, W, Y, X) at the points."""
         intensity = U.real**2 + U.imag**2
         if self.weight is None:
             return light_of_radii(self.grid, self.cutoff, self.order, intensity[..., 0, :])
