@@ -51,6 +51,7 @@ from raytrace.settings import CodesignSettings
 from raytrace.system.lens import with_object_distance
 from raytrace.system.parameter_paths import BadVariables
 from raytrace.tracing.focus import NoImage, best_focus, focused
+from raytrace.tracing.geometry import Unbuildable
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 from raytrace.wave_optics.compute import phase_elements
 from raytrace.wave_optics.element import phase_element
@@ -623,6 +624,28 @@ def test_distances_in_metres_and_points_beyond_the_sensor_are_refused():
         own(torch.rand(1, 1, 32, 32), 25.0)
     with pytest.raises(ValueError, match="beyond the edges of the sensor of 24 x 16 mm"):
         own(torch.rand(1, 1, 32, 32), 25e3, points=torch.tensor([[12.1], [0.0]]))
+    for distance in (math.nan, 0.0):
+        with pytest.raises(ValueError, match="expected distances in mm, not 0 or nan"):
+            own.kernels([distance, 2e4], [0, 0])
+    with pytest.raises(NoImage, match=r"object_distances 10 to 50 mm: no real image .* give the range of the scene in"):
+        Camera(own.variables, Same(), object_distances=(10, 50))
+    with pytest.raises(ValueError, match="expected distances in mm, not 0"):
+        Camera(own.variables, Same(), object_distances=(0, 5e4))
+
+
+def test_a_thickness_that_training_has_turned_negative_is_said_once():
+    """In a plain loop of torch, which has neither `project` nor `violation`."""
+    own = Camera(Variables(read_lens("cooke_triplet"), "thickness:2,4"), Same(), pixels=7, model=Gaussian(order=3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Unbuildable)
+        own.kernels(2e4)
+    with torch.no_grad():
+        own.variables.get_parameter("thickness_2").sub_(20.0 / own.variables.variables[0].unit)
+    with pytest.warns(Unbuildable, match="no limit of thicknesses is met: give Variables"):
+        own.kernels(2e4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Unbuildable)
+        own.kernels(2e4)
 
 
 def test_places_given_in_another_order_are_refused():

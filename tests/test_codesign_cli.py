@@ -182,6 +182,7 @@ def test_a_run_as_built_resumes_and_lists_its_perturbed_cameras(run, pictures, m
         (("--grade", "precison"), "invalid choice: 'precison'"),
         (("--grade", "high", "--model", "paraxial"), "model 'paraxial' traces no rays of a lens as built"),
         (("--grade", "high", "--loss", "spectral"), "--as-built, --grade and --limits belong to training"),
+        (("--turns", "1", "--loss", "spectral"), "--turns belongs to training"),
         (("--grade", "high", "--rays", "20"), "not supported with fixed pupil points .*: give center chief"),
     ],
 )
@@ -308,6 +309,19 @@ def test_a_lens_by_steps_of_second_order_stays_while_the_network_is_trained(run,
 
 
 @pytest.mark.slow
+def test_spots_between_the_fields_of_a_codesign_are_said(run, pictures):
+    """Two fields far apart, of a lens with a tangential field far from flat between them."""
+    options = ("--loss", "spectral", "--model", "paraxial", "--field", "0", "12", "--limit", "3")
+    code, out, err = run("cooke_triplet", "--data", pictures, *options)
+    assert code == 0, err
+    line = "the spots of the fields and wavelengths of the loss" in out
+    assert line != ("RMS spot radius between the fields" in out)
+    code, out, _ = run("cooke_triplet", "--data", pictures, *options, "--json")
+    (spot,) = json.loads(out)["between"]
+    assert spot["samples"] == "fields"
+    assert spot["ratio"] > 0
+
+
 def test_spectral_at_infinity_is_valid_json(run, pictures):
     """A sensor kept 0.4 mm nearer than the focal plane: null in the file and in --json, "infinity" in words."""
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")

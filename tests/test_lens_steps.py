@@ -11,6 +11,7 @@ import torch
 import raytrace as rt
 from raytrace.imaging.closed_form import camera_error, even_distances, least_of_closed_form, optimise_closed_form
 from raytrace.imaging.lens_steps import LensSteps
+from raytrace.optimization.problem import NoProblem
 from raytrace.tracing.geometry import Unbuildable
 
 TRIPLET = rt.read_lens("cooke_triplet")
@@ -92,6 +93,32 @@ def test_steps_of_a_loaded_state_are_those_that_were_not_interrupted():
     resumed.load_state_dict(own.state_dict())
     assert step(own) == step(resumed)
     assert resumed.variables.numbers() == own.variables.numbers()
+
+
+def test_a_loss_without_a_number_moves_nothing_and_is_forgotten():
+    """One bad batch: the steps before and after it are those of a loop without it."""
+    own, other = camera("curvature:1 sensor"), camera("curvature:1 sensor")
+
+    def loss(of):
+        return lambda: -of.kernels(2e4).square().sum()
+
+    values = [own.lens_step(loss(own))]
+    for scale, words in ((np.nan, "loss is nan at the current lens"), (np.inf, "loss is -inf")):
+        before = own.variables.numbers()
+        with pytest.raises(NoProblem, match=words):
+            own.lens_step(lambda scale=scale: scale * loss(own)())
+        assert own.variables.numbers() == before
+    values.append(own.lens_step(loss(own)))
+    assert values == [other.lens_step(loss(other)) for _ in range(2)]
+    for wrong, words in (
+        (lambda: loss(own)().detach(), "no derivative by the variables"),
+        (lambda: 1.0, "expected a tensor of one number"),
+        (lambda: own.kernels(2e4), "expected one number"),
+    ):
+        with pytest.raises(NoProblem, match=words):
+            own.lens_step(wrong)
+    with pytest.raises(TypeError, match="expected a function"):
+        own.lens_step(loss(own)())
 
 
 def test_a_step_to_a_lens_that_cannot_be_made_is_said_once():

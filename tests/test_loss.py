@@ -262,12 +262,69 @@ def test_what_goes_with_rows_alone_is_refused():
     for given, words in (
         ({"vary": "sensor glass:1"}, "goes with a merit of rows"),
         ({"of": "lens", "object_distances": [1e3]}, "goes with a quantity"),
-        ({"merit": mean_square}, "give one of them"),
+        ({"merit": mean_square}, "give one; rows to minimise before are `first`"),
+        ({"merit": "wavefront"}, "give one; rows to minimise before are `first`"),
+        ({"paths": 2}, "`paths` are of a merit of rows"),
+        ({"restarts": -1}, "`restarts` -1: expected 0 or more"),
+        ({"check_rings": 8}, "expected more than the rings of the descent, 8"),
+        ({"object_distances": [1e4, 0.0]}, "expected distances in mm, not 0 or nan"),
     ):
         with pytest.raises(NoProblem, match=words):
             rt.optimize(TRIPLET, **{"loss": mean_square, "vary": "sensor", **given})
     with pytest.raises(ValueError, match="did you mean points"):
         rt.optimize(TRIPLET, loss=mean_square, of="point", vary="sensor")
+
+
+@pytest.mark.parametrize("merit", ["spot", mean_square])
+def test_what_goes_with_a_loss_alone_is_refused(merit):
+    """A reader of a result of rows would believe that the distances count."""
+    for given in ({"object_distances": [1e4]}, {"of": "otf"}, {"restarts": 7}, {"check_rings": 30}, {"first": None}):
+        with pytest.raises(NoProblem, match=rf"`{next(iter(given))}` goes with `loss`"):
+            rt.optimize(TRIPLET, merit=merit, vary="sensor", **given)
+    with pytest.raises(NoProblem, match="`object_distances` goes with `loss`"):
+        rt.search(TRIPLET, object_distances=[1e4])
+
+
+@pytest.mark.parametrize(
+    ("loss", "of", "words"),
+    [
+        (lambda points: mean_square(points).detach(), "points", "no derivative by the variables"),
+        (lambda points: float(mean_square(points)), "points", r"the loss is .*; expected a tensor of one number"),
+        (lambda points: points.std(-1), "points", r"has the shape \(2, 1, 3, 3\); expected one number"),
+        (lambda otf: (1 - otf).mean(), "otf", r"is complex; expected a real number: take \.abs\(\)"),
+    ],
+)
+def test_what_is_no_loss_is_refused(loss, of, words):
+    with pytest.raises(NoProblem, match=words):
+        rt.optimize(TRIPLET, loss=loss, of=of, first=None, **FEW)
+    with pytest.raises(TypeError, match=r"quantity as Points\(rings=12\)"):
+        rt.optimize(TRIPLET, loss=low_contrast, of=Otf, **FEW)
+
+
+def test_another_loss_of_the_same_name_does_not_resume(tmp_path):
+    """Its stored values would be those of the other one."""
+    kept = tmp_path / "kept.json"
+
+    def of_power(power):
+        return lambda otf: (1 - otf.abs() ** power).mean()
+
+    how = {"of": TRANSFER, "first": None, **FEW}
+    rt.optimize(TRIPLET, loss=of_power(1), cycles=2, checkpoint=kept, **how)
+    with pytest.raises(rt.BadCheckpoint, match="another function than that of the checkpoint"):
+        rt.optimize(TRIPLET, loss=of_power(4), cycles=4, resume=kept, **how)
+    again = rt.optimize(TRIPLET, loss=of_power(1), cycles=4, resume=kept, **how)
+    assert again.merit_after == rt.optimize(TRIPLET, loss=of_power(1), cycles=4, **how).merit_after
+
+
+def test_both_ends_of_the_headline_are_of_the_same_rays():
+    few = rt.optimize(TRIPLET, loss=low_contrast, of=Otf(rings=2), cycles=60, **FEW)
+    assert few.loss.refined
+    rings = 2 * 2**few.loss.refined
+    assert few.merit_before == few.loss.start_refined
+    assert few.merit_before == pytest.approx(float(low_contrast(Otf(rings=rings)(TRIPLET))), rel=1e-12)
+    assert few.merit_after == pytest.approx(float(low_contrast(Otf(rings=rings)(few.lens))), rel=1e-9)
+    assert f"({few.loss.first_cycles} of pre-optimisation)" in str(few)
+    assert few.loss.first_cycles > 0
 
 
 def test_a_descent_begins_at_the_start_where_rays_fail_at_the_best_spots():

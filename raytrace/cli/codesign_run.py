@@ -40,6 +40,7 @@ from raytrace.imaging.training import read_json, read_log
 from raytrace.io import FORMATS, read_lens, write_lens
 from raytrace.io.zemax import write as zemax
 from raytrace.maths.result import Column, Result, Table, plain
+from raytrace.optimization.between import Between, between, summary, warn_of_worse
 from raytrace.plotting.style import FIELD_COLOURS, Figure, new_figure, styled
 from raytrace.settings import CodesignSettings
 from raytrace.settings import read as read_settings
@@ -286,11 +287,16 @@ def train_run(experiment: Experiment, settings: CodesignSettings, folder: Path, 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CodesignResult(Result):
-    """The outcome of a run, or the optimum of the closed form. curves: losses by their name, for the figure."""
+    """The outcome of a run, or the optimum of the closed form.
+
+    curves: losses by their name, for the figure; between: spots of the lens between the fields that the loss has, none
+    where these are places all over a sensor.
+    """
 
     experiment: Experiment
     lens: Outcome | Optimum
     curves: dict[str, Sequence[float]]
+    between: tuple[Between, ...] = ()
 
     @styled
     def draw(self) -> Figure:
@@ -314,7 +320,9 @@ class CodesignResult(Result):
     def document(self) -> dict:
         limits = dataclasses.asdict(variables(self.experiment.lens, self.experiment.settings).limits)
         settings = dataclasses.asdict(self.experiment.settings)
-        return plain({"settings": settings, **self.experiment.about, "limits": limits, **self.lens.document()})
+        between = {"between": [dataclasses.asdict(spot) for spot in self.between]} if self.between else {}
+        about = {"settings": settings, **self.experiment.about, "limits": limits}
+        return plain({**about, **self.lens.document(), **between})
 
     def tables(self) -> list[Table]:
         result = self.lens
@@ -359,6 +367,18 @@ class CodesignResult(Result):
         )
         thicknesses = f"glass {glass}, its edge {limits.edge:.4g} at least, air {air} (mm)"
         yield f"penalty {result.penalty:.6g} mm², not part of the loss; thicknesses: {thicknesses}"
+        yield from summary(self.between, "the spots of the fields and wavelengths of the loss")
+
+
+def _between_fields(lens: Lens, settings: CodesignSettings) -> tuple[Between, ...]:
+    """Spots between the fields of a co-design, focused at the middle of its range; warns of those much larger."""
+    if settings.sensor or len(settings.fields) < 2:
+        return ()
+    distance = 2 / (1 / settings.near + 1 / settings.far)
+    view = lens.at(fields=[*settings.fields], wavelengths=[*settings.wavelengths], object_distance=distance)
+    found = tuple(gap for gap in between(view) if gap.samples != "rays")
+    warn_of_worse(found)
+    return found
 
 
 def _place_lines(result: Outcome) -> Iterator[str]:
@@ -400,15 +420,16 @@ def _train(arguments: argparse.Namespace) -> None:
     experiment = open_experiment(arguments, settings_of(arguments, stored), pictures)
     settings = experiment.settings
     result = train_run(experiment, settings, folder, f"{settings.model}, seed {settings.seed}")
+    lens = read_lens(folder / LENS, catalogs=experiment.catalogs)
     if lens_file and not share().rank:
-        write_lens(read_lens(folder / LENS, catalogs=experiment.catalogs), lens_file, catalogs=experiment.catalogs)
+        write_lens(lens, lens_file, catalogs=experiment.catalogs)
     in_turns = [f"network_{turn}" for turn in range(1, settings.turns + 1)]
     curves: dict[str, Sequence[float]] = {
         f"step {k}": [row["loss"] for name in names for row in read_log(folder / name / "log.csv")]
         for k, names in enumerate(([STEPS[0], *in_turns], [STEPS[1]]), 1)
     }
     _present(
-        CodesignResult(experiment, result, curves),
+        CodesignResult(experiment, result, curves, _between_fields(lens, settings)),
         arguments,
         f"{folder / 'outcome.json'}, {lens_file or folder / LENS}",
     )
@@ -420,11 +441,15 @@ def _spectral(arguments: argparse.Namespace) -> None:
     settings = settings_of(arguments)
     if settings.is_toleranced:
         raise CommandError("--as-built, --grade and --limits belong to training; leave them out, or --loss spectral")
+    if settings.turns or settings.relearn:
+        name = "--turns" if settings.turns else "--relearn"
+        raise CommandError(f"{name} belongs to training; leave out {name} or --loss spectral")
     experiment = open_experiment(arguments, settings)
     optimum = closed_form(experiment.lens, experiment.settings, experiment.spectrum(), catalogs=experiment.catalogs)
     for name in optimum.at_end:
         say(f"warning: {name} ends at a bound, and the loss still falls beyond it")
-    result = CodesignResult(experiment, optimum, {"closed form": optimum.course})
+    spots = _between_fields(optimum.lens, experiment.settings)
+    result = CodesignResult(experiment, optimum, {"closed form": optimum.course}, spots)
     folder, lens_file = _outputs(arguments)
     written: object = lens_file
     if lens_file:

@@ -90,6 +90,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.tolerancing.perturbation import check_tolerances
 from raytrace.tolerancing.sampling import draw_errors
 from raytrace.tolerancing.table import ToleranceTable
+from raytrace.tracing.focus import NoImage, real_image_distance
 from raytrace.tracing.geometry import Unbuildable, defects
 from raytrace.tracing.launch import UnfilledStop, warn_of_filling
 from raytrace.tracing.scene import Memo
@@ -211,6 +212,7 @@ class Camera(nn.Module, Generic[V]):
         self._check_element()
         with torch.no_grad():
             lens = self.lens()
+            self._check_range(lens)
         if fields is None and sensor is None:
             fields = [0]
         #: Field points (2, F) of the places that `field` numbers, and their points (2, F) mm where these stay.
@@ -243,6 +245,20 @@ class Camera(nn.Module, Generic[V]):
         if not is_alone and (self.exact or self.filter is not None):
             option = "exact" if self.exact else "filter"
             raise ValueError(f"{option} applies only to a phase element without a lens: leave {option} out")
+
+    def _check_range(self, lens: Lens) -> None:
+        """Refuse a range of object distances that has no real image on the sensor's side. Raises ValueError."""
+        near, far = self.range
+        if not (abs(near) > 0 and abs(far) > 0):
+            raise ValueError(f"object_distances {near:g} to {far:g} mm: expected distances in mm, not 0")
+        if self.elements():
+            return  # which may focus the light
+        try:
+            real_image_distance(lens, lens.wavelengths.new_tensor(self.range))
+        except NoImage as error:
+            raise NoImage(
+                f"object_distances {near:g} to {far:g} mm: {error}; give the range of the scene in mm"
+            ) from None
 
     @property
     def picture_sensor(self) -> Sensor:
@@ -338,13 +354,28 @@ class Camera(nn.Module, Generic[V]):
         if self._steps is None:
             self._steps = LensSteps(self.variables)
         before = self._steps.step(loss)
-        if not self._is_unbuildable and (defect := next(iter(defects(self.variables())), None)):
+        self._warn_of_defects(self.variables())
+        return before
+
+    def _warn_of_defects(self, lens: Lens) -> None:
+        """Warn once of a lens that cannot be made."""
+        if not self._is_unbuildable and (defect := next(iter(defects(lens)), None)):
             self._is_unbuildable = True
             advice = "give Variables(…, hold='buildable'), or add camera.variables.violation() to the loss"
             warnings.warn(
                 f"{defect}; no limit of thicknesses is met: {advice}", Unbuildable, stacklevel=calling_level()
             )
-        return before
+
+    @uncompiled
+    def _warn_of_negative_gaps(self, lens: Lens) -> None:
+        """Warn once of a lens that cannot be made, after a training has turned the sign of a thickness."""
+        if self._is_unbuildable or not isinstance(self.variables, Variables):
+            return
+        now, start = (
+            torch.stack([s.thickness.detach() for s in of.surfaces[1:-1]]) for of in (lens, self.variables.lens)
+        )
+        if bool(((now < 0) & (start >= 0)).any()):  # all defects take longer to find than kernels
+            self._warn_of_defects(lens)
 
     def __getstate__(self) -> dict:
         """The state without the step history of `lens_step`."""
@@ -543,6 +574,7 @@ class Camera(nn.Module, Generic[V]):
         if len(distances) == 1:  # of all places
             distances = distances.expand(points.shape[-1] if isinstance(points, Tensor) else np.size(field))
         lens, count = nominal, len(distances)
+        self._warn_of_negative_gaps(nominal)
         if points is None and self.points is not None:
             points = self._of_field(self.points, field, count)
         if points is not None:
@@ -638,6 +670,8 @@ class Camera(nn.Module, Generic[V]):
         if distances.dim() > 1 or not distances.numel():
             shape = tuple(distances.shape)
             raise ValueError(f"object_distances of shape {shape}: expected (B,) mm, one for each of B images, B ≥ 1")
+        if not bool((distances.detach().abs() > 0).all()):
+            raise ValueError(f"object distances {distances.detach().tolist()}: expected distances in mm, not 0 or nan")
         near = min(self.range)
         if bool((distances.detach().abs() < _NEAREST * near).any()):
             least = float(distances.detach().abs().min())
@@ -699,7 +733,8 @@ class Camera(nn.Module, Generic[V]):
         ):
             raise ValueError(
                 f"pictures of shape {tuple(np.shape(picture))} at {count} object distances: expected "
-                f"({count}, {len(channels)}, H, W), one for each, of the channels {', '.join(channels)} of the sensor"
+                f"({count if count > 1 else 'B'}, {len(channels)}, H, W), of the channels {', '.join(channels)} of the "
+                "sensor, one picture for each distance"
             )
         if (most := float(light.detach().max())) > _LARGEST:
             raise ValueError(

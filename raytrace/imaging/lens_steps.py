@@ -16,8 +16,9 @@ from raytrace.imaging.variables import Variables
 from raytrace.optimization.least_squares import Descent, Slope, SumOfSquares, TensorDescent
 from raytrace.optimization.lifted import OPTIONS, Lifted
 from raytrace.optimization.merit import DefaultMerit
-from raytrace.optimization.problem import Problem, typical_of
+from raytrace.optimization.problem import NoProblem, Problem, refuse_detached, scalar_loss, typical_of
 from raytrace.tracing.compiled import prepare
+from raytrace.words import named_value
 
 
 class LensSteps:
@@ -55,6 +56,7 @@ class LensSteps:
         of the gradient within a call.
         """
         self._begin(loss)
+        self._refuse_infinite()
         descent = self.lifted.step(self._numbers(), self.damping)
         self.damping = descent.cycles[-1].damping if descent.cycles else OPTIONS.damping
         self._end(descent)
@@ -68,6 +70,7 @@ class LensSteps:
     def minimise(self, loss: Callable[[], Tensor], *, cycles: int = 300) -> TensorDescent:
         """Descend to the minimum of a loss, a function without arguments of the current lens."""
         self._begin(loss)
+        self._refuse_infinite()
         start = self._numbers()
         is_flat = not self._function(start)[1].any()
         descent = self.lifted.descend(start, cycles=0 if is_flat else cycles)
@@ -77,7 +80,19 @@ class LensSteps:
         at_end = (gradient != 0) & np.isclose(x, reached, rtol=1e-9, atol=1e-9)
         return TensorDescent((*self._values, descent.state.cost), tuple(at_end.tolist()), is_flat)
 
+    def _refuse_infinite(self) -> None:
+        """Raise NoProblem, before anything moves, for a loss without a finite number and gradient."""
+        value, gradient = self._function(self._numbers())
+        if not (math.isfinite(value) and np.isfinite(gradient).all()):
+            what = f"loss is {value:g}" if not math.isfinite(value) else "gradient of the loss is not finite"
+            raise NoProblem(
+                f"the {what} at the current lens, which was left as it is: check the pictures of this step, and that "
+                "all fields and distances have light"
+            )
+
     def _begin(self, loss: Callable[[], Tensor]) -> None:
+        if not callable(loss):
+            raise TypeError(f"the loss is {named_value(loss)}; expected a function, as lambda: … .mean()")
         self._loss, self._last = loss, None
         self.lifted.lower, self.lifted.upper = self._ends()
         self._values.clear()
@@ -112,8 +127,10 @@ class LensSteps:
         self._put(x)
         moved = [parameter for parameter in self.parameters if parameter.requires_grad]
         with torch.enable_grad():
-            loss = self._loss()
-        by = torch.autograd.grad(loss, moved, materialize_grads=True) if loss.requires_grad else None
+            loss = scalar_loss(self._loss())
+        if moved:
+            refuse_detached(loss)
+        by = torch.autograd.grad(loss, moved, materialize_grads=True) if moved else None
         gradient, each = np.zeros(len(x)), iter(by or [])
         for k, (variable, parameter) in enumerate(zip(self.variables.variables, self.parameters, strict=True)):
             if by is not None and parameter.requires_grad:

@@ -78,8 +78,8 @@ def worse_between(lens: Lens) -> tuple[Between, ...]:
     return tuple(worst for worst in between(lens) if worst.is_worse)
 
 
-def summary(gaps: Sequence[Between]) -> list[str]:
-    """Lines of the gaps that are worse, and one of the largest ratios of all others."""
+def summary(gaps: Sequence[Between], beside: str = "the spots of the merit function") -> list[str]:
+    """Lines of the gaps that are worse, and one of the largest ratios of all others; beside: what they are between."""
     lines = [str(gap) for gap in gaps if gap.is_worse]
     largest: dict[str, Between] = {}
     for gap in gaps:
@@ -88,7 +88,7 @@ def summary(gaps: Sequence[Between]) -> list[str]:
     even = [f"{gap.ratio:.3g} {_EVEN[gap.samples]}" for gap in largest.values() if not gap.is_worse]
     return [
         *lines,
-        *([f"largest ratio of RMS spot radii to the spots of the merit function: {', '.join(even)}"] if even else []),
+        *([f"largest ratio of RMS spot radii to {beside}: {', '.join(even)}"] if even else []),
     ]
 
 

@@ -23,6 +23,7 @@ from raytrace.words import option
 _DENSER_CHANGE = 0.02  # relative change of a loss by denser rays, above which the descent continues
 _ROUNDS = 3  # of denser rays
 _UNLIMITED = 300  # cycles of a descent without other limits
+_SAME = 1e-6  # relative difference of the same loss between two runs: aimed rays begin elsewhere
 
 #: Invoked after each cycle with its report and the variables (n,).
 Watch: TypeAlias = Callable[[Cycle, np.ndarray], object]
@@ -48,9 +49,15 @@ class Loss:
         object_distances: Sequence[float] | None,
         check_rings: int | None = None,
     ) -> "Loss":
-        """Raises NoProblem for distances or rings of a function of the lens itself."""
+        """Raises NoProblem for distances or rings of a function of the lens itself, for rings that are no more than
+        those of the quantity, and for distances of 0 or nan."""
         if quantity is None and check_rings is not None:
             raise NoProblem(f"{option('check_rings')} goes with a quantity, as {option('of', 'points')}")
+        if quantity is not None and check_rings is not None:
+            try:
+                quantity.denser(check_rings)
+            except ValueError as error:
+                raise NoProblem(str(error)) from None
         if object_distances is None:
             return cls(function, quantity, check_rings=check_rings)
         if quantity is None:
@@ -59,6 +66,10 @@ class Loss:
                 "of the lens uses lens.at(object_distance=…)"
             )
         distances = torch.as_tensor(object_distances, dtype=torch.float64).reshape(-1)
+        if not bool((distances.abs() > 0).all()):
+            raise NoProblem(
+                f"{option('object_distances')} {distances.tolist()}: expected distances in mm, not 0 or nan"
+            )
         return cls(function, quantity, distances, check_rings)
 
     @property
@@ -87,7 +98,8 @@ class LossReport:
 
     first: nan where rays that the loss needs fail there: the descent then begins at the initial lens; has_first:
     whether rows were minimised first; refined: descents with more rays, because a check changed the loss by more than
-    2 %.
+    2 %; start_refined: of the initial lens with as many rays as the end, nan without such descents;
+    first_cycles: of the pre-optimisation.
     """
 
     start: float
@@ -97,12 +109,20 @@ class LossReport:
     checked: float
     refined: int = 0
     has_first: bool = False
+    start_refined: float = np.nan
+    first_cycles: int = 0
+
+    @property
+    def start_of_end(self) -> float:
+        """The loss of the initial lens, by the rays of the end where they do not fail."""
+        return self.start_refined if np.isfinite(self.start_refined) else self.start
 
     def stages(self) -> list[tuple[str, float]]:
         """(stage, loss) of the stages with a finite loss."""
         listed = [("at the start", self.start), ("after pre-optimisation", self.first)]
         listed += [("after the descent", end) for end in self.ends[:1]]
         listed += [("from a displaced lens", end) for end in self.ends[1:]]
+        listed += [("at the start with more rays", self.start_refined)]
         listed += [("with more rays", self.end)] if self.refined else []
         return [stage for stage in [*listed, ("by denser rays", self.checked)] if np.isfinite(stage[1])]
 
@@ -189,7 +209,7 @@ class LossDescents:
                 "reduce the fields or the aperture, or start from another lens"
             )
         best = self._descend(self.function, x, watch)
-        ends, checked, refined = [best.state.cost], np.nan, 0
+        ends, checked, refined, start_refined = [best.state.cost], np.nan, 0, np.nan
         random = np.random.default_rng(0)
         try:
             loss = self.loss.denser()
@@ -209,16 +229,27 @@ class LossDescents:
                 if is_same or not np.isfinite(checked) or self._is_over() or refined == _ROUNDS:
                     break
                 best, refined = self._descend(function, best.state.x, watch), refined + 1
+                start_refined = _finite_or_inf(function, start)
                 loss = loss.denser()
                 function = self._by(loss)
                 checked = np.nan if function is None else _finite_or_inf(function, best.state.x)
         except KeyboardInterrupt:  # outside the cycles of a descent
             self.stopped, checked = "interrupted", np.nan
-        report = LossReport(initial_loss, pre_optimised_loss, tuple(ends), best.state.cost, checked, refined, first)
+        report = LossReport(
+            initial_loss, pre_optimised_loss, tuple(ends), best.state.cost, checked, refined, first, start_refined,
+            cycles_used,
+        )  # fmt: skip
         return LossDescent(
             best.state.x, tuple(self.history), self.stopped or best.stopped, cycles_used + len(self.history),
             self.evaluations, report,
         )  # fmt: skip
+
+    def is_that_of(self, evaluated: np.ndarray) -> bool:
+        """Whether the loss has the value and the gradient of an earlier evaluation."""
+        x, value, gradient = np.split(evaluated, [len(evaluated) // 2, len(evaluated) // 2 + 1])
+        now, slope = FunctionMerit(self.problem.model, self.loss)(x)
+        size = _SAME * max(np.abs(gradient).max(initial=0.0), np.finfo(float).tiny)
+        return abs(now - value[0]) <= _SAME * abs(value[0]) and bool((np.abs(slope - gradient) <= size).all())
 
     @property
     def evaluations(self) -> int:

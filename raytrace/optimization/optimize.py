@@ -1,6 +1,7 @@
 """Optimising: the lens at a minimum of its merit function, from the lens as it is (`opening`, `least_squares`)."""
 
 import dataclasses
+import inspect
 import logging
 import os
 import time
@@ -102,7 +103,8 @@ def optimize(
     (`optimization.conditions`), in addition to `lens.conditions` and instead of its conditions of the same
     quantity; stored: False, or None as `hold`: without the conditions of the lens. The optimised lens has all of them.
     as_built: `rt.tolerancing.AsBuilt`, the expected mean square spot of the manufactured lens as a term of the merit.
-    cycles, seconds: limits, by default 500 cycles a path; paths: damping strategies to try.
+    cycles, seconds: limits, by default 500 cycles a path, and 300 a descent of a loss, without those of `first`;
+    paths: damping strategies to try.
     catalog: shipped catalogs or AGF files for variable glasses, by default those of the lens, else SCHOTT
     (`optimization.glass_choice`); glasses: a selection of them, as "preferred price<=3 transmittance:0.4>=0.98", by
     default without obsolete, special and radiation-hard ones (`rt.glasses`), but with the lens's own. mounts: materials
@@ -184,9 +186,19 @@ def optimize(
         return _Observer(log, file, progress and progress(cycles, "cycle"), descent, shown)
 
     dependencies: dict[str, object] = {}
+    if loss is not None and merit is not None:
+        raise NoProblem(
+            f"{option('loss')} and {option('merit')}: give one; rows to minimise before are {option('first')}"
+        )
+    if loss is None:
+        _refuse_without_loss(
+            of=of, object_distances=object_distances, first=first, restarts=restarts, check_rings=check_rings
+        )
+    if (loss is not None or callable(merit)) and paths != 1:
+        raise NoProblem(f"{option('paths')} are of a merit of rows; a loss has {option('restarts')}")
+    if restarts < 0:
+        raise NoProblem(f"{option('restarts')} {restarts}: expected 0 or more")
     if callable(merit):
-        if loss is not None:
-            raise NoProblem(f"{option('loss')} and a function as {option('merit')}: give one of them")
         loss, first, restarts, quantity, merit = merit, None, 0, None, None
     else:
         quantity = quantity_of(of)
@@ -229,6 +241,12 @@ def optimize(
     if loss is not None:
         measured = Loss.of(loss, quantity, object_distances, check_rings)
         descents = LossDescents(problem, measured, (lower, upper), resumed.evaluated)
+        if len(resumed.evaluated) and not descents.is_that_of(resumed.evaluated[0]):
+            raise BadCheckpoint(
+                f"{resume}: the loss is another function than that of the checkpoint, though of the same name: at the "
+                "first lens of that run it has another value; give that function, without noise of its own, or start "
+                f"without {option('resume')}"
+            )
         with observer(dependencies, lens_at) as seen:
 
             def each(cycle: Cycle, x: np.ndarray) -> None:
@@ -243,7 +261,8 @@ def optimize(
             )  # fmt: skip
         return ended(
             reached.x, reached.history, problem.evaluated(reached.x), cycles=reached.cycles, stopped=reached.stopped,
-            merits=(reached.report.start, reached.report.end), evaluations=reached.evaluations, loss=reached.report,
+            merits=(reached.report.start_of_end, reached.report.end), evaluations=reached.evaluations,
+            loss=reached.report,
         )  # fmt: skip
     evaluating = time.monotonic()
     before = problem.evaluated(model.start)
@@ -325,6 +344,14 @@ def optimize(
         glasses=tuple(choice.steps) if choice else (), chosen_from=choice and choice.pool.listing,
         as_built=None if term is None else AsBuiltChange.of(term, lens, lens_at(x)), fitted=fitted,
     )  # fmt: skip
+
+
+def _refuse_without_loss(**options: object) -> None:
+    """Raise NoProblem for options of a loss, without one, that differ from their default values."""
+    defaults = {name: part.default for name, part in inspect.signature(optimize).parameters.items()}
+    for name, setting in options.items():
+        if not (setting is defaults[name] or (isinstance(setting, str | int) and setting == defaults[name])):
+            raise NoProblem(f"{option(name)} goes with {option('loss')}, a function that is minimised: leave it out")
 
 
 def _warn_of_contacts(design: Lens, moved: Lens) -> None:

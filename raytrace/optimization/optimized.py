@@ -206,7 +206,8 @@ class Optimized(Result):
             self.lens.name,
             f"  {self.measure} {self.merit_before:.8g} → {self.merit_after:.8g}"
             + (f", {ratio:.4g} times less" if 1.1 < ratio < np.inf else ""),
-            f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            f"  {self._cycles_in_words()}, {self.evaluations} evaluations, {self.seconds:.1f} s; "
+            + STOPPED[self.stopped],
             *([f"  {self.as_built}"] if self.as_built else []),
             *([f"  {line}" for line in self.loss.lines()] if self.loss else []),
             *(f"  {step.words}; merit {step.reached:.6g}, predicted {step.predicted:.6g}" for step in self.spacers),
@@ -233,6 +234,10 @@ class Optimized(Result):
             *([self._lengths()] if self.has_configurations else []),
             rows,
         ]
+
+    def _cycles_in_words(self) -> str:
+        of_first = self.loss.first_cycles if self.loss else 0
+        return f"{self.cycles} cycles" + (f" ({of_first} of pre-optimisation)" if of_first else "")
 
     def _unsharp_start(self) -> list[str]:
         """A line where most rows of the MTF start near zero, where the MTF has side lobes and nearly no slope."""

@@ -33,7 +33,7 @@ from raytrace.optimization.variables import DesignVariables
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.surface import is_posed
-from raytrace.words import RaytraceError, option
+from raytrace.words import RaytraceError, named_value, option
 
 #: Weight of a miss of 1 relative to the charge for a failed ray, and the margin by which a ray is brought back.
 STEEP, MARGIN = 5.0, 0.1
@@ -176,6 +176,26 @@ class NoLight(RaytraceError, ValueError):
 
 class NoProblem(RaytraceError, ValueError):
     """An optimisation without variables, rows or light; the message says what is missing."""
+
+
+def scalar_loss(loss: object) -> Tensor:
+    """A loss as a real tensor (). Raises NoProblem for other values, which a function returned by mistake."""
+    if not isinstance(loss, Tensor):
+        raise NoProblem(f"the loss is {named_value(loss)}; expected a tensor of one number, without float() or .item()")
+    if loss.numel() != 1:
+        raise NoProblem(f"the loss has the shape {tuple(loss.shape)}; expected one number: take its .mean() or .sum()")
+    if loss.is_complex():
+        raise NoProblem("the loss is complex; expected a real number: take .abs() or .real, as of a transfer function")
+    return loss.reshape(())
+
+
+def refuse_detached(loss: Tensor) -> None:
+    """Raise NoProblem for a loss outside the graph of the variables."""
+    if not loss.requires_grad:
+        raise NoProblem(
+            "the loss has no derivative by the variables: compute it from its argument by torch, without .detach(), "
+            ".numpy() or torch.no_grad()"
+        )
 
 
 class Specification:
@@ -342,10 +362,9 @@ class FunctionMerit:
             return float(known[len(x)]), known[len(x) + 1 :].copy()
         variables = torch.tensor(x, requires_grad=True)
         with torch.enable_grad():
-            merit = self.function(self.model.lens_at(variables)).reshape(())
-        slope = np.zeros(len(x))
-        if merit.requires_grad:
-            slope = torch.autograd.grad(merit, variables, materialize_grads=True)[0].numpy()
+            merit = scalar_loss(self.function(self.model.lens_at(variables)))
+        refuse_detached(merit)
+        slope = torch.autograd.grad(merit, variables, materialize_grads=True)[0].numpy()
         value = float(merit.detach())
         self.known[key] = np.array([*x, value, *slope])
         self.evaluated.append(self.known[key])

@@ -36,7 +36,14 @@ class Quantity(Protocol):
     def __call__(self, lens: Lens, object_distances: Tensor | None) -> Tensor: ...
 
     def denser(self, rings: int | None = None) -> Self:
-        """The same quantity by more rays: of so many rings, or twice as many."""
+        """The same quantity by more rays: of so many rings, or twice as many. Raises ValueError for no more."""
+
+
+def _more(now: int, asked: int | None, what: str) -> int:
+    """So many rings as asked for, or twice as many as now."""
+    if asked is not None and asked <= now:
+        raise ValueError(f"{option('check_rings')} {asked}: expected more than the {what} of the descent, {now}")
+    return asked or _DENSER * now
 
 
 def of_configurations(quantity: Quantity, lens: Lens, object_distances: Tensor | None) -> Tensor:
@@ -71,7 +78,7 @@ class Points:
         return torch.stack([torch.where(rays.valid, rays.position[:2], torch.nan) for rays in traced], 1)
 
     def denser(self, rings: int | None = None) -> "Points":
-        return Points(rings or _DENSER * self.rings)
+        return Points(_more(self.rings, rings, "rings"))
 
 
 @value
@@ -94,7 +101,7 @@ class Otf:
         return torch.polar(torch.ones_like(phase), phase).mean(-1)
 
     def denser(self, rings: int | None = None) -> "Otf":
-        return dataclasses.replace(self, rings=rings or _DENSER * self.rings)
+        return dataclasses.replace(self, rings=_more(self.rings, rings, "rings"))
 
 
 @value
@@ -120,7 +127,7 @@ class Kernels:
         return kernels.reshape(-1, *kernels.shape[-4:])
 
     def denser(self, rings: int | None = None) -> "Kernels":
-        return dataclasses.replace(self, order=rings or _DENSER * self.order)
+        return dataclasses.replace(self, order=_more(self.order, rings, "order"))
 
 
 #: Quantities by the name of `of`.
@@ -130,7 +137,7 @@ QUANTITIES = {"points": Points, "otf": Otf, "kernels": Kernels}
 def quantity_of(word: "str | Quantity") -> Quantity | None:
     """The quantity of a name, None of "lens". Raises ValueError."""
     if not isinstance(word, str):
-        if isinstance(word, Quantity):
+        if isinstance(word, Quantity) and not isinstance(word, type):
             return word
         raise TypeError(f"{option('of')} is {named_value(word)}; expected a name, or a quantity as Points(rings=12)")
     if word == "lens":

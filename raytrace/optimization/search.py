@@ -438,6 +438,9 @@ def search(
         as_built.of(lens)  # raises BadTolerance before the search
     if folder is not None:
         check_output_folder(folder)
+    if loss is None and (object_distances is not None or of != "points"):
+        name = "of" if object_distances is None else "object_distances"
+        raise NoProblem(f"{option(name)} goes with {option('loss')}, a function that is minimised: leave it out")
     measured = None if loss is None else Loss.of(loss, quantity_of(of), object_distances)
     if measured is not None and as_built is not None:
         raise NoProblem(f"{option('as_built')} orders minima by a merit of rows: leave it or {option('loss')} out")
