@@ -279,12 +279,15 @@ FLAT = {
 @pytest.mark.parametrize("elements", FLAT.values(), ids=FLAT)
 @pytest.mark.parametrize("y", [0.0, 10.0])
 def test_without_height_the_kernel_is_that_of_the_wave_model(elements, y):
-    """Bit for bit where the element keeps the symmetry of the lens; on the axis else to the digits of torch's J₀."""
+    """Bit for bit where the element keeps the symmetry of the lens; on the axis else to the digits of torch's J₀.
+    Pixels are summed over a grid, on which the rim of the pupil is exact to 5e-6."""
     view = view_of(slow_gauss(), y)
     pixels = window(view)
     expected = wave.kernels(view, pixels, order=1).kernel
     result = bridge.kernels(view, elements, pixels, order=1)
-    assert (result.kernel - expected).abs().max() <= (2e-7 if y == 0 else 1e-14) * expected.max()
+    has_pixels = any(isinstance(element.profile, Pixels) for element in elements)
+    bound = 5e-6 if has_pixels else 2e-7 if y == 0 else 1e-14
+    assert (result.kernel - expected).abs().max() <= bound * expected.max()
     if all(isinstance(element.profile, EvenPowers | Rings) for element in elements):
         assert torch.equal(result.kernel, expected)
 

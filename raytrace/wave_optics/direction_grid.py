@@ -120,12 +120,6 @@ def cells_across(directions: Directions, pixels: Sequence[Element], phase: float
     return cells
 
 
-def mean_phasor(pixels: Sequence[Element], wavelengths: Tensor) -> Tensor:
-    """The mean (W,) of the phasor of elements in contact over their pixels."""
-    means = [_phasors(element, wavelengths).mean((-2, -1)) for element in pixels]
-    return functools.reduce(torch.mul, means)
-
-
 def amplitude(
     directions: Directions,
     front: Wavefront,
@@ -134,13 +128,10 @@ def amplitude(
     *,
     pixels: Sequence[Element],
     others: Sequence[Element],
-    mean: Tensor,
     cells: int,
 ) -> Tensor:
-    """U (D, F, W, Y, X) in 1/mm, as `wave.amplitude`, of the pixels less their mean phasor (W,).
-
-    others: elements in contact that have no pixels.
-    """
+    """U (D, F, W, Y, X) in 1/mm, as `wave.amplitude`; front: of which the directions are; others: elements in contact
+    that have no pixels; cells: of the grid across."""
     phasors = [_phasors(element, front.wavelength) for element in pixels]
     inside = (1e-3 * front.wavelength / front.index).expand(directions.centre.shape[1:])
     x, y = (t.expand(*inside.shape, t.shape[-1]) for t in (x, y))
@@ -150,7 +141,7 @@ def amplitude(
         kernel, smooth = (d, f, w), _on_grid(directions.series[:, d, f, w], steps)
         (opd, stop_x, stop_y, *_, density), one_colour = smooth, front.wavelength[w : w + 1]
         opd = opd + path(others, stop_x, stop_y, one_colour)[0] if others else opd
-        cells_lit = _light_in_cells(smooth, [phasor[w] for phasor in phasors], pixels, mean[w])
+        cells_lit = _light_in_cells(smooth, [phasor[w] for phasor in phasors], pixels)
         field = density * dft.phasor(opd / (1e-3 * one_colour)) * cells_lit
         half = directions.half[:, d, f, w]
         L, M = directions.centre[:, d, f, w, None] + half[:, None] * steps
@@ -172,12 +163,12 @@ def _phasors(element: Element, wavelengths: Tensor) -> Tensor:
     return dft.phasor(waves[:, None, None] * heights)
 
 
-def _light_in_cells(smooth: Tensor, phasors: Sequence[Tensor], pixels: Sequence[Element], mean: Tensor) -> Tensor:
-    """The share of each cell (M, L) in the pupil times the mean phasor there less that of all pixels."""
+def _light_in_cells(smooth: Tensor, phasors: Sequence[Tensor], pixels: Sequence[Element]) -> Tensor:
+    """The share of each cell (M, L) in the pupil times the phasor of the pixels there."""
     _, stop_x, stop_y, pupil_x, pupil_y, _ = smooth
     pairs = zip(phasors, pixels, strict=True)
     means = [_restored(_mean_of_pixels(phasor, _pixels(element), stop_x, stop_y), 2) for phasor, element in pairs]
-    return _restored(_share_inside(pupil_x, pupil_y), 1) * (functools.reduce(torch.mul, means) - mean)
+    return _restored(_share_inside(pupil_x, pupil_y), 1) * functools.reduce(torch.mul, means)
 
 
 def _restored(cells: Tensor, times: int) -> Tensor:
@@ -218,9 +209,11 @@ def _neighbours(place: Tensor, width: Tensor, count: int) -> tuple[Tensor, Tenso
 
 
 def _share_inside(x: Tensor, y: Tensor) -> Tensor:
-    """The share (M, L) of each cell in the unit disc of pupil points, its rim a straight line within the cell."""
+    """The share (M, L) of each cell in the unit disc of pupil points, its rim a straight line within the cell, moved by
+    what the cell loses to its bend."""
     r = safe_sqrt(x * x + y * y)
     across, along = (_slope(r, axis).abs() for axis in (-1, -2))
+    r = r + safe_divide(across * across + along * along, 24 * r)
     most, least = torch.maximum(across, along), torch.minimum(across, along)
     least = torch.maximum(least, 1e-3 * most)
     # The mean of a step over a rectangle: second integrals of it at the corners.

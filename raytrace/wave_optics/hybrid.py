@@ -48,7 +48,6 @@ from raytrace.wave_optics.direction_grid import (
     TooCoarse,
     cells_across,
     directions_of,
-    mean_phasor,
     rays_of_series,
 )
 from raytrace.wave_optics.direction_grid import amplitude as amplitude_of_pixels
@@ -244,39 +243,26 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     if any(bool(((n - 1).abs() > 1e-3).any()) for n in media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]):
         raise ValueError(f"elements need air on both sides; the stop, surface {stop}, borders on another medium")
 
+    radial = all(is_radial(element) for element in elements)
     pixels = tuple(element for element in elements if isinstance(element.profile, Pixels))
     others = tuple(element for element in elements if not isinstance(element.profile, Pixels))
-    radial = all(is_radial(element) for element in elements)
 
     def of_field(part: Scene, window: Grid) -> Kernels:
         probe = probe_of(part)
         gridded = _directions(part, probe) if pixels else None
-        traced = elements if gridded is None else others
         points = sensor_points(part, probe, window, order, is_round=radial and symmetry(part) == "round")
-        reach = points.corner + _reach_of_elements(part, probe, elements, stepped=traced)
-        phase = phase_along_radius(probe, reach)
-        rings, arms = rings_and_arms(phase, order)
-        if traced and rings * arms > _MOST_RAYS:
-            raise TooCoarse(
-                f"the elements need {rings} × {arms} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a "
-                "smaller window, or the wave camera, which takes any height but no lens"
-            )
-        light = waves(part, reach, order=order, probe=probe)
-        arrived = light.wavefront.energy.sum(-1)
-        if traced:
-            light = _through(traced, part, light, arms)
-        count = light.amplitude.shape[-1]
-        U = amplitude(light, points.x, points.y)
-        if gridded is not None:
+        stepped = elements if gridded is None else others
+        reach = points.corner + _reach_of_elements(part, probe, elements, stepped=stepped)
+        if gridded is None:
+            light = _over_rays(part, probe, elements, reach, order)
+            U, front, samples = amplitude(light, points.x, points.y), light.wavefront, light.amplitude.shape[-1]
+        else:
             directions, front = gridded
-            cells = cells_across(directions, pixels, phase, order)
-            mean = mean_phasor(pixels, front.wavelength)
-            U = mean[:, None, None] * U + amplitude_of_pixels(
-                directions, front, points.x, points.y, pixels=pixels, others=others, mean=mean, cells=cells
-            )
-            count = cells**2
+            cells = cells_across(directions, pixels, phase_along_radius(probe, reach), order)
+            U = amplitude_of_pixels(directions, front, points.x, points.y, pixels=pixels, others=others, cells=cells)
+            samples = cells**2
         kernel, centroid, covariance = points.integrated_amplitude(U, probe)
-        return Kernels(kernel, window, centroid, covariance, count, arrived)
+        return Kernels(kernel, window, centroid, covariance, samples, front.energy.sum(-1))
 
     return by_field(scene, grid, of_field)
 
@@ -288,8 +274,19 @@ def _directions(scene: Scene, probe: Wavefront) -> tuple[Directions, Wavefront] 
     return None if directions is None else (directions, front)
 
 
-def _through(elements: tuple[Element, ...], scene: Scene, light: Waves, arms: int) -> Waves:
+def _over_rays(
+    scene: Scene, probe: Wavefront, elements: tuple[Element, ...], reach: Tensor | float, order: int
+) -> Waves:
     """Waves with the path of elements, all rays of them where an element does not share their symmetry."""
+    rings, arms = rings_and_arms(phase_along_radius(probe, reach), order)
+    if elements and rings * arms > _MOST_RAYS:
+        raise TooCoarse(
+            f"the elements need {rings} × {arms} rays, more than {_MOST_RAYS}: take coarser or weaker ones, a "
+            "smaller window, or the wave camera, which takes any height but no lens"
+        )
+    light = waves(scene, reach, order=order, probe=probe)
+    if not elements:
+        return light
     stop = _at_stop(scene, light.wavefront.pupil)
     if light.symmetry != "none" and not all(is_radial(element) for element in elements):
         light, stop = _unfolded(light, stop, arms)
