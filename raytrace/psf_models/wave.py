@@ -94,11 +94,6 @@ def waves(scene: Scene, reach: Tensor | float, *, order: int = 0, probe: Wavefro
     return Waves(safe_sqrt(front.energy * solid), front, fold)
 
 
-def density_of_light(probe: Wavefront, pupil: Tensor, weights: Tensor) -> Tensor:
-    """1/Ω (..., P): times the energy of rays of pupil points and weights, the light of a unit of directions (L, M)."""
-    return 1 / (math.pi * weights * _jacobian(_direction_map(probe), pupil))
-
-
 def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
     """U (D, F, W, Y, X) in 1/mm at x (..., X), y (..., Y) mm from the chief ray's point, by a matrix DFT."""
     front = waves.wavefront

@@ -2,8 +2,9 @@
 
     U(x, y) = (n/λ) Σ_kl a_kl q_kl exp(2πi [W_kl + n (L_k x + M_l y)]/λ) h_L h_M
 
-L_k and M_l are equidistant, so that the sum is two products of matrices. Wavefront W, amplitude a, place in the stop
-and pupil point are smooth over the directions: series through a thousand traced rays. q is the phasor of the pixels,
+L_k and M_l are equidistant, so that the sum is two products of matrices. Wavefront W, place in the stop, pupil point p
+and its light are smooth over the directions: series through a thousand traced rays; a² is the light of a unit of the
+pupil times |∂p/∂(L, M)|. q is the phasor of the pixels,
 averaged over a cell twice, and the share of the cell in the pupil, with steps and rim straight within a cell. A mean
 has the transform sinc(h f): nothing of a step is folded back at f = 1/h, 2/h, …, and the first term of what is lost
 below is restored.
@@ -23,7 +24,6 @@ from raytrace.maths.bivariate import powers, zernike_to_powers
 from raytrace.maths.numerics import safe_divide, safe_sqrt, value, varies
 from raytrace.maths.sampling import gauss_rings
 from raytrace.psf_models import dft
-from raytrace.psf_models.wave import density_of_light
 from raytrace.tracing.scene import Scene, trace_scene
 from raytrace.tracing.wavefront import Wavefront
 from raytrace.wave_optics.element import Element, Pixels, excess_index, fabricated_height, path
@@ -52,7 +52,7 @@ class Directions:
 
     centre, half: (2, D, F, W) of the square of directions; series: (6, D, F, W, degree + 1, degree + 1), coefficients
     of powers of M (rows) and L in units of the half square, of the OPD in mm, x and y in the stop in mm, x and y of the
-    pupil point, and the amplitude; extent: largest width of the beam in the stop, mm.
+    pupil point, and the root of the light of a unit of the pupil; extent: largest width of the beam in the stop, mm.
     """
 
     centre: Tensor
@@ -61,11 +61,12 @@ class Directions:
     extent: float
 
 
-def directions_of(scene: Scene, probe: Wavefront, front: Wavefront, at_stop: Tensor) -> Directions | None:
+def directions_of(scene: Scene, front: Wavefront, at_stop: Tensor) -> Directions | None:
     """The series of one field through the rays of a front, those of `rays_of_series`, which meet the stop at `at_stop`
-    (2, D, F, W, P) mm; probe: as for `wave.waves`.
+    (2, D, F, W, P) mm.
 
-    None where the pupil is clipped, where a series misses a ray, and where the grid is turned against the pixels.
+    None where the pupil is clipped, where its directions do not lie within the ellipse of their square, where a series
+    misses a ray, and where the grid is turned against the pixels.
     """
     pupil, weights = front.pupil, front.weights
     with torch.no_grad():
@@ -77,17 +78,19 @@ def directions_of(scene: Scene, probe: Wavefront, front: Wavefront, at_stop: Ten
     low, high = directions.amin(-1), directions.amax(-1)
     centre, half = 0.5 * (low + high), 0.5 * _MARGIN * (high - low)
     places = (directions - centre[..., None]) / half[..., None]
-    amplitude = safe_sqrt(front.energy * density_of_light(probe, pupil, weights))
-    numbers = torch.stack(torch.broadcast_tensors(front.opd, *at_stop, *pupil, amplitude))
+    is_within = (places.detach().square().sum(0) < 1).all()
+    root = safe_sqrt(front.energy / (math.pi * weights))
+    numbers = torch.stack(torch.broadcast_tensors(front.opd, *at_stop, *pupil, root))
     basis = zernike.polynomials(_ORDERS, *places)
     terms = zernike.fit(numbers, basis, weights)
     with torch.no_grad():
         missed = (numbers - torch.einsum("...j,j...p->...p", terms, basis)).abs().amax(-1)
         extent = (at_stop.amax(-1) - at_stop.amin(-1)).amax()
-        waves, places = missed[0] / (1e-3 * front.wavelength), missed[1:3] / extent
+        waves, off = missed[0] / (1e-3 * front.wavelength), missed[1:3] / extent
         tilts = terms[1:3, ..., 1:3].abs()  # of x and y in the stop, by L and M
         turn = (tilts[0, ..., 1] + tilts[1, ..., 0]) / tilts.amax((0, -1))
-        if not scene.everywhere((waves < _CLOSE).all() & (places < 1e-3 * _CLOSE).all() & (turn < _TURNED).all()):
+        is_close = (waves < _CLOSE).all() & (off < 1e-3 * _CLOSE).all() & (turn < _TURNED).all()
+        if not scene.everywhere(is_within & is_close):
             return None
     return Directions(centre, half, _in_powers(terms), float(scene.largest(extent)))
 
@@ -136,14 +139,17 @@ def amplitude(
     inside = (1e-3 * front.wavelength / front.index).expand(directions.centre.shape[1:])
     x, y = (t.expand(*inside.shape, t.shape[-1]) for t in (x, y))
     steps = (torch.arange(cells, dtype=x.dtype, device=x.device) + 0.5) * (2 / cells) - 1
+    is_within = steps**2 + (steps**2)[:, None] < 1  # series have no meaning beyond
     fields = []
     for d, f, w in itertools.product(*map(range, inside.shape)):  # each alone: a grid has many cells
-        kernel, smooth = (d, f, w), _on_grid(directions.series[:, d, f, w], steps)
-        (opd, stop_x, stop_y, *_, density), one_colour = smooth, front.wavelength[w : w + 1]
+        kernel, one_colour = (d, f, w), front.wavelength[w : w + 1]
+        series, half = directions.series[:, d, f, w], directions.half[:, d, f, w]
+        smooth = _on_grid(series, steps)
+        opd, stop_x, stop_y, *_, root = smooth
+        light = root * safe_sqrt(_stretch(series[3:5], steps) / half.prod())
         opd = opd + path(others, stop_x, stop_y, one_colour)[0] if others else opd
         cells_lit = _light_in_cells(smooth, [phasor[w] for phasor in phasors], pixels)
-        field = density * dft.phasor(opd / (1e-3 * one_colour)) * cells_lit
-        half = directions.half[:, d, f, w]
+        field = torch.where(is_within, light * dft.phasor(opd / (1e-3 * one_colour)) * cells_lit, 0.0)
         L, M = directions.centre[:, d, f, w, None] + half[:, None] * steps
         along_x = dft.phasor(L[:, None] * (x[kernel] / inside[kernel]))
         along_y = dft.phasor(y[kernel][:, None] * (M / inside[kernel]))
@@ -232,10 +238,17 @@ def _slope(values: Tensor, axis: int) -> Tensor:
     return 0.5 * (torch.cat([first, change], axis) + torch.cat([change, last], axis))
 
 
-def _on_grid(series: Tensor, steps: Tensor) -> Tensor:
-    """Values (..., M, L) of series (..., degree + 1, degree + 1) at the same steps of M and L."""
-    powers_of = steps ** torch.arange(series.shape[-1], dtype=steps.dtype, device=steps.device)[:, None]
-    return powers_of.mT @ (series @ powers_of)
+def _on_grid(series: Tensor, steps: Tensor, by_M: int = 0, by_L: int = 0) -> Tensor:
+    """Values (..., M, L) of series (..., degree + 1, degree + 1) at the same steps of M and L, or slopes by one."""
+    order = torch.arange(series.shape[-1], dtype=steps.dtype, device=steps.device)[:, None]
+    values, slopes = steps**order, order * steps ** (order - 1).clamp_min(0)
+    return (values, slopes)[by_M].mT @ (series @ (values, slopes)[by_L])
+
+
+def _stretch(pupil: Tensor, steps: Tensor) -> Tensor:
+    """|∂(p_x, p_y)/∂(L, M)| (M, L) in units of the half square, by the series (2, degree + 1, degree + 1) of p."""
+    (x_L, y_L), (x_M, y_M) = _on_grid(pupil, steps, by_L=1), _on_grid(pupil, steps, by_M=1)
+    return (x_L * y_M - x_M * y_L).abs()
 
 
 @functools.cache

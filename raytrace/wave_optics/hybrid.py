@@ -249,7 +249,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 
     def of_field(part: Scene, window: Grid) -> Kernels:
         probe = probe_of(part)
-        gridded = _directions(part, probe) if pixels else None
+        gridded = _directions(part) if pixels else None
         points = sensor_points(part, probe, window, order, is_round=radial and symmetry(part) == "round")
         stepped = elements if gridded is None else others
         reach = points.corner + _reach_of_elements(part, probe, elements, stepped=stepped)
@@ -267,10 +267,10 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     return by_field(scene, grid, of_field)
 
 
-def _directions(scene: Scene, probe: Wavefront) -> tuple[Directions, Wavefront] | None:
+def _directions(scene: Scene) -> tuple[Directions, Wavefront] | None:
     """`directions_of` one field, and the rays of its series."""
     front = wavefront_of(scene, *rays_of_series(scene.wavelengths))
-    directions = directions_of(scene, probe, front, _at_stop(scene, front.pupil))
+    directions = directions_of(scene, front, _at_stop(scene, front.pupil))
     return None if directions is None else (directions, front)
 
 
