@@ -376,9 +376,9 @@ def _between_fields(lens: Lens, settings: CodesignSettings) -> tuple[Between, ..
         return ()
     distance = 2 / (1 / settings.near + 1 / settings.far)
     view = lens.at(fields=[*settings.fields], wavelengths=[*settings.wavelengths], object_distance=distance)
-    found = tuple(gap for gap in between(view) if gap.samples != "rays")
-    warn_of_worse(found)
-    return found
+    gaps = tuple(gap for gap in between(view) if gap.samples != "rays")
+    warn_of_worse(gaps)
+    return gaps
 
 
 def _place_lines(result: Outcome) -> Iterator[str]:

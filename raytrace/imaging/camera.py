@@ -371,9 +371,8 @@ class Camera(nn.Module, Generic[V]):
         """Warn once of a lens that cannot be made, after a training has turned the sign of a thickness."""
         if self._is_unbuildable or not isinstance(self.variables, Variables):
             return
-        now, start = (
-            torch.stack([s.thickness.detach() for s in of.surfaces[1:-1]]) for of in (lens, self.variables.lens)
-        )
+        lenses = lens, self.variables.lens
+        now, start = (torch.stack([s.thickness.detach() for s in each.surfaces[1:-1]]) for each in lenses)
         if bool(((now < 0) & (start >= 0)).any()):  # all defects take longer to find than kernels
             self._warn_of_defects(lens)
 
