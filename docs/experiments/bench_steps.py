@@ -139,21 +139,29 @@ def element() -> None:
 
 
 def stop() -> None:
-    lens, side = rt.focus(rt.read_lens("double_gauss")).lens.at(wavelengths=[0.55]), 200
-    aperture = 2.1 * float(stop_radius(lens))
-    heights = 2e-4 * torch.rand(side, side, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    heights.requires_grad_()
+    side, distances = 200, [1e4, 2e4, 4e4, 1e5]
+    for name in ("double_gauss", "tessar"):
+        lens = rt.focus(rt.read_lens(name)).lens.at(wavelengths=[0.55])
+        aperture = 2.1 * float(stop_radius(lens))
+        heights = 2e-4 * torch.rand(side, side, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        heights.requires_grad_()
 
-    def step():
-        plate = rt.element(heights, aperture=aperture, glass=1.5, pitch=1.02 * aperture / side)
-        found = rt.wave_optics.hybrid_psf(lens, plate, fields=[0.0], object_distances=[1e4, 2e4, 4e4, 1e5])
-        found.kernel.square().sum().backward()
-        return found
+        def kernels(order, lens=lens, aperture=aperture, heights=heights):
+            plate = rt.element(heights, aperture=aperture, glass=1.5, pitch=1.02 * aperture / side)
+            return rt.wave_optics.hybrid_psf(lens, plate, fields=[0.0], object_distances=distances, order=order)
 
-    rays = int(step().rays)
-    print(
-        f"{side} × {side} heights at the stop, {rays} rays: {1e3 * medians({'step': step})['step']:.0f} ms", flush=True
-    )
+        def step(kernels=kernels):
+            kernels(0).kernel.square().sum().backward()
+
+        seconds = medians({"step": step})["step"]
+        with torch.no_grad():
+            usual, fine = kernels(0), kernels(3)
+        change = (usual.kernel - fine.kernel).abs().sum((-2, -1)) / fine.kernel.sum((-2, -1))
+        print(
+            f"{name}, {side} × {side} heights at the stop, {int(usual.rays)} samples: {1e3 * seconds:.0f} ms; order 0 "
+            f"differs from order 3 by {float(change.max()):.1e} of the light",
+            flush=True,
+        )
 
 
 PARTS = {"clipped": clipped, "built": built, "element": element, "stop": stop}

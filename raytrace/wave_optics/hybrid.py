@@ -234,15 +234,13 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     Flat pixels are summed over a square grid of directions (`direction_grid`), with four cells of it to a pixel in
     order 0, which leaves an error of 1e-4 to 1e-3 of the light. Kernels of rings and wrapped heights, and of pixels in
     a clipped beam, are sums over rays and converge slowly, by the rays across a step. Moments are those of the light
-    inside the window. Raises ValueError for a stop between other media than air, a beam wider than an
-    element at the stop (by more than 5 %), TooCoarse where more than 400,000 rays or 4,096² directions would be
-    needed.
+    inside the window. Raises ValueError for a stop between other media than air, a beam wider than an element at the
+    stop (by more than 5 %), TooCoarse where more than 400,000 rays or 4,096² directions would be needed.
     """
     elements = tuple(to(element, dtype=torch.float64) for element in elements)
     stop = scene.lens.stop
     if any(bool(((n - 1).abs() > 1e-3).any()) for n in media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]):
         raise ValueError(f"elements need air on both sides; the stop, surface {stop}, borders on another medium")
-
     radial = all(is_radial(element) for element in elements)
     pixels = tuple(element for element in elements if isinstance(element.profile, Pixels))
     others = tuple(element for element in elements if not isinstance(element.profile, Pixels))
